@@ -25,7 +25,7 @@ class PluginChoice(Config):
 
 
 class LegacyConfig(Config):
-    """Clients of the legacy protocol. They carry no token."""
+    """Clients of the legacy protocol. They have no token."""
 
     allow_from: Annotated[tuple[str, ...], Field(max_length=64)] = ()
     """Permitted addresses and networks, e.g. 192.168.1.7 or 192.168.1.0/24; required beyond loopback."""
@@ -55,7 +55,7 @@ class RobotConfig(Config):
     camera: PluginChoice = PluginChoice(kind="sim")
     drive: PluginChoice = PluginChoice(kind="sim")
     range_sensor: PluginChoice | None = None
-    """Range sensor; default: that of the simulation with a simulated drive, else none. Kind "none" switches it off."""
+    """Range sensor; default: the simulated sensor with a simulated drive, else no sensor. Kind "none" disables it."""
     battery: PluginChoice | None = None
     """Battery sensor; without one the robot does not measure its battery."""
     legacy: LegacyConfig = LegacyConfig()
@@ -66,7 +66,7 @@ class RobotConfig(Config):
     max_frame_bytes: Annotated[int, Field(ge=1_000, le=1_000_000)] = 400_000
     """Security limit: the robot does not send larger images."""
     state_dir: Path = Path("~/.local/state/sightline")
-    """Folder that stores the STOP latch over restarts."""
+    """Folder that stores the STOP latch across restarts."""
 
     @property
     def doors(self) -> tuple[str, ...]:
@@ -75,13 +75,13 @@ class RobotConfig(Config):
 
     @property
     def devices(self) -> dict[str, PluginChoice | None]:
-        """Return the device in use of each kind by its key, or None where the robot has no such device."""
+        """Return the device in use for each key, or None if the robot has no such device."""
         return {"camera": self.camera, "drive": self.motors, "range_sensor": self.ranging,
                 "battery": self.battery}
 
     @property
     def motors(self) -> PluginChoice:
-        """Return the drive in use. The drive `gpio` also receives the wheel radius, because its table is in meters."""
+        """Return the drive in use. The drive `gpio` also gets the wheel radius, because its table is in meters."""
         if self.drive.kind != "gpio":
             return self.drive
         options = {"wheel_radius_m": self.wheels.wheel_radius_m, **self.drive.options}

@@ -1,4 +1,4 @@
-"""Differential drive: twist <-> wheel speeds, saturation that keeps the curve, odometry. Pure."""
+"""Differential drive: twist <-> wheel speeds, saturation that preserves the curve, odometry. Pure."""
 
 import math
 from typing import Annotated
@@ -9,7 +9,7 @@ from sightline.protocol.config import Config
 from sightline.protocol.messages import STILL, Planar, Pose, Twist
 from sightline.robot_side.ports import WheelAngles
 
-_RATE_WINDOW_US = 40_000  # speeds are taken over at least this long: one encoder step in 20 ms is already 0.2 rad/s
+_RATE_WINDOW_US = 40_000  # shortest time for a speed: one encoder step in 20 ms is already 0.2 rad/s
 
 
 class DiffDriveConfig(Config):
@@ -20,11 +20,11 @@ class DiffDriveConfig(Config):
     track_width_m: Annotated[float, Field(gt=0.02, lt=3.0)] = 0.174
     """Distance between the two driven wheels."""
     max_wheel_rad_s: Annotated[float, Field(gt=0.1, lt=500.0)] = 22.0
-    """Highest wheel speed; a faster twist is scaled so that its curve stays."""
+    """Highest wheel speed; a faster twist is scaled so that its curve stays the same."""
 
 
 def wheel_speeds(drive: DiffDriveConfig, twist: Twist) -> tuple[float, float]:
-    """(left, right) rad/s for `twist`. Beyond `max_wheel_rad_s` both are scaled by one factor, so the curve stays."""
+    """Return (left, right) rad/s for `twist`. Above `max_wheel_rad_s` one factor scales both, so the curve stays."""
     half_turn_mps = twist.angular_rad_s * drive.track_width_m / 2
     left = (twist.linear_mps - half_turn_mps) / drive.wheel_radius_m
     right = (twist.linear_mps + half_turn_mps) / drive.wheel_radius_m
@@ -50,16 +50,16 @@ class Odometer:
 
     @property
     def pose(self) -> Pose:
-        """(x_m, y_m, yaw_rad) since the start; yaw within +-pi."""
+        """Return (x_m, y_m, yaw_rad) since the start; yaw within +-pi."""
         return self._x_m, self._y_m, math.remainder(self._yaw_rad, math.tau)
 
     @property
     def moving(self) -> Planar:
-        """(linear_mps, angular_rad_s) over the last 40 ms or more."""
+        """Return (linear_mps, angular_rad_s), averaged over at least the last 40 ms."""
         return self._moving.linear_mps, self._moving.angular_rad_s
 
     def update(self, wheels: WheelAngles) -> None:
-        """Take one reading. Readings not newer than the last are ignored.
+        """Process one reading. A reading that is not newer than the last one is ignored.
 
         Raises:
             ValueError: an angle is not finite.

@@ -1,19 +1,19 @@
 """The pipe between driver and network process: packets, pending requests, and both ends. Shell.
 
-    network -> driver   RAW          bytes of a twist or request as they came: channel, source, header, payload
+    network -> driver   RAW          bytes of a twist or request as received: channel, source, header, payload
                         STREAM       stream counters, JSON
-                        REJECTED     what the transport rejected so far: how often, by reason
-                        FAULTS       exceptions since the last such packet: how often, by part
+                        REJECTED     rejections of the transport so far: count by reason
+                        FAULTS       exceptions since the last such packet: count by part
                         READY        the endpoint is open
                         TOKEN        the token of a driver appeared or ended
               aside     ISSUED       a frame is about to be published: seq, capture time, fingerprint
-    driver -> network   COMMAND_ACK  a twist was validated: whose, which frame, computing time, and the holder
+    driver -> network   COMMAND_ACK  a twist was validated: sender, frame, computing time, lease holder
                         PUBLISH      bytes to publish: channel, header, payload
-              aside     MOTION       what the header of the next frame contains of the robot
+              aside     MOTION       motion of the robot for the header of the next frame
 
-`aside` is a second socket that no process waits on: the process that needs what is there reads it all first. So a frame
-that leaves wakes no driver just when vision wants the processor, and no tick wakes the network process. The driver
-reads ISSUED before it validates a RAW: it was sent before the frame, so it is there before any answer.
+`aside` is a second socket that no process waits on; a process reads all of it when it needs the data. So a frame that
+leaves does not wake the driver while the vision service needs the processor, and a tick does not wake the network
+process. The driver reads ISSUED before it validates a RAW. ISSUED is sent before the frame, so before any answer.
 """
 
 import json
@@ -65,7 +65,7 @@ class PacketKind(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class RobotMotion:
-    """The robot at this moment, for frame headers."""
+    """The current motion of the robot, for frame headers."""
 
     pose: Pose = (0.0, 0.0, 0.0)
     moving: Planar = (0.0, 0.0)
@@ -75,7 +75,7 @@ class RobotMotion:
 
 @dataclass(frozen=True, slots=True)
 class CommandAck:
-    """A twist was validated (accepted or rejected): it answers frame `seq`; `holder` drives now."""
+    """A twist was validated (accepted or rejected). It answers frame `seq`; `holder` holds the lease now."""
 
     sender: Holder
     seq: int
@@ -94,13 +94,13 @@ def pack_issued(seq: int, t_us: int, fingerprint: int) -> bytes:
 
 
 def unpack_issued(packet: bytes) -> tuple[int, int, int]:
-    """(seq, t_us, fingerprint)."""
+    """Decode a packet of `pack_issued`: (seq, t_us, fingerprint)."""
     _, seq, t_us, fingerprint = _ISSUED.unpack(packet)
     return seq, t_us, fingerprint
 
 
 def pack_motion(motion: RobotMotion) -> bytes:
-    """Encode the motion of the robot at this moment."""
+    """Encode the current motion of the robot."""
     latency_us = -1 if motion.latency_us is None else motion.latency_us
     return _MOTION.pack(PacketKind.MOTION, *motion.pose, *motion.moving, *motion.applied, latency_us)
 
@@ -138,7 +138,7 @@ def _unpack_holder(source: bytes, session: bytes) -> Holder | None:
 
 
 def pack_counts(kind: PacketKind, counts: Mapping[str, int]) -> bytes:
-    """Pack counts by name: REJECTED or FAULTS."""
+    """Encode counts by name: REJECTED or FAULTS."""
     return bytes([kind]) + json.dumps(dict(counts)).encode()
 
 
@@ -154,12 +154,12 @@ def pack_token(token: str, is_present: bool) -> bytes:
 
 
 def unpack_token(packet: bytes) -> tuple[str, bool]:
-    """(token, is_present)."""
+    """Decode a packet of `pack_token`: (token, is_present)."""
     return packet[2:].decode(), bool(packet[1])
 
 
 def pack_message(kind: PacketKind, message: Message) -> bytes:
-    """RAW or PUBLISH: a message of the wire, undecoded."""
+    """Encode an undecoded message of the wire: RAW or PUBLISH."""
     head = _PARTS.pack(kind, message.channel.name.encode(), message.source.encode(), len(message.header))
     return head + message.header + message.payload
 
@@ -173,20 +173,20 @@ def unpack_message(packet: bytes) -> Message:
     return Message(channel, source.rstrip(b"\0").decode(), packet[start:body], packet[body:])
 
 
-# Requests that the driver's socket had no room for: kept until it has, STOP ahead of all. Pure.
+# Requests without room in the driver's socket: stored until there is room, STOP first. Pure.
 #
-# A twist that finds no room is dropped, for a newer one follows. A request comes once or is a STOP: it waits.
+# A twist without room is dropped, because a newer one follows. A request is not repeated, or is a STOP, so it waits.
 
 
 MAX_PENDING: Final = 32
 """Security limit: requests that wait for room in the socket to the driver."""
 
 
-# The network process's hold on its driver: both sockets, and the requests that found no room. Shell.
+# The network process's end of the pipe: both sockets, and the waiting requests. Shell.
 
 
 class NetworkEnd:
-    """The driver as its network process sees it. Only `receive` waits; any thread may call."""
+    """The network process's end of the pipe. Only `receive` waits. Thread-safe."""
 
     def __init__(self, waited: socket.socket, aside: socket.socket) -> None:
         self._waited, self._aside = waited, aside
@@ -209,15 +209,15 @@ class NetworkEnd:
         return last
 
     def send(self, packet: bytes) -> bool:
-        """Hand over a packet that the driver waits for; False if there is no room."""
+        """Send a packet that wakes the driver. Returns False without room."""
         return _send_if_room(self._waited, packet)
 
     def send_aside(self, packet: bytes) -> bool:
-        """Hand over what the driver reads when it needs it; False if there is no room."""
+        """Send a packet that the driver reads when it needs it. Returns False without room."""
         return _send_if_room(self._aside, packet)
 
     def forward(self, message: Message) -> None:
-        """Hand over a command at once, undecoded. Without room a request waits; a twist is dropped and counted.
+        """Send a command immediately, undecoded. Without room a request waits; a twist is dropped and counted.
 
         Next: `robot_side/driver/process.py`: `Driver.loop`.
         """
@@ -229,7 +229,7 @@ class NetworkEnd:
                 self.dropped_commands += 1
 
     def retry(self) -> None:
-        """Hand over the requests that wait, as far as there is room now."""
+        """Send the waiting requests while there is room."""
         if len(self._pending_requests):
             with self._order:
                 self._pending_requests.flush(self._pass)
@@ -246,13 +246,13 @@ def _send_if_room(end: socket.socket, packet: bytes) -> bool:
     return True
 
 
-# The driver's hold on its network process: start it, talk to it without ever waiting for it, start it again. Shell.
+# The driver's end of the pipe: start and restart the network process, and send packets without waiting. Shell.
 
 
-_PACKETS_PER_WAKE = 64  # a flood is drained in portions, so that no tick waits for its end
-_PACKETS_ASIDE = 1024  # more than that socket holds: all of it, but not for ever
-_DRAIN_US = 500_000  # to read what a dead process sent; a descendant may hold its end open
-_FIRST_BACKOFF_US = 700_000  # the wheels are at zero before a peer can drive them again
+_PACKETS_PER_WAKE = 64  # a flood is read in portions, so that no tick waits for its end
+_PACKETS_ASIDE = 1024  # more than the socket holds, but a limit
+_DRAIN_US = 500_000  # to read the packets of a dead process; a descendant may keep its end open
+_FIRST_BACKOFF_US = 700_000  # the wheels are at zero before a peer can drive again
 _LONGEST_BACKOFF_US = 2_000_000
 _WEDGED_US = 2_000_000
 _STARTS_WITHIN_US = 30_000_000  # a first start reads its packages from a slow card
@@ -264,8 +264,8 @@ _CHILD: Final = (
     "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); "
     "from sightline.robot_side.network.process import main; main()"
 )
-"""It looks for modules where the driver does: neither first in the folder that it starts in, where a file of the user's
-may be called as one of Python's, nor in another copy of this package than the driver's."""
+"""It uses the module search path of the driver. The current folder is not first, because a file there may have the name
+of a Python module, and no other copy of this package is found."""
 
 
 class NetworkSetup(Config):
@@ -275,7 +275,7 @@ class NetworkSetup(Config):
     session: SessionId
     first_seq: int
     is_restart: bool = False
-    """The camera is opened after the link then: without a camera, too, the robot remains reachable."""
+    """True after a restart. The camera is then opened after the link, so that the robot remains reachable."""
     camera_fault: str = ""
     """Why the last process had no image."""
     camera_patience_us: int = _FIRST_PATIENCE_US
@@ -283,7 +283,7 @@ class NetworkSetup(Config):
 
 
 class DriverEnd:
-    """The network process as the driver sees it. No method waits for it, except `close`."""
+    """The driver's end of the pipe. No method waits for the network process, except `close`."""
 
     def __init__(self, config: RobotConfig, session: str) -> None:
         self._received = False
@@ -292,9 +292,9 @@ class DriverEnd:
         self._session = session
         self._process: subprocess.Popen[bytes] | None = None
         self.socket: socket.socket | None = None
-        """To wait on: commands from it, acks and messages to it."""
+        """Commands from the network process; acks and messages to it. The driver waits on it."""
         self._aside: socket.socket | None = None
-        """No process waits on it: frames issued, and the robot's motion. It wakes neither end."""
+        """Issued frames and the robot's motion. No process waits on it."""
         self._gone_us = 0
         self._start_at_us = 0
         self._backoff_us = _FIRST_BACKOFF_US
@@ -306,13 +306,13 @@ class DriverEnd:
         self.failed_at_start = False
 
     def keep_alive(self, now_us: int, first_seq: int) -> None:
-        """Start it if it is not there and its time has come."""
+        """Start the network process if it is not running and the backoff is over."""
         if self._process is not None and self._process.poll() is not None and self._is_read(now_us):
             self._on_exit(self._process.returncode, now_us)
         if self._received:
             self._received, self._received_us = False, now_us
         if self._process is not None and self._was_ready and now_us - self._received_us > _WEDGED_US:
-            self._process.kill()  # stopped or wedged: it reports five times a second while it is well
+            self._process.kill()  # stopped or hung: a running process reports five times a second
         if self._process is None and now_us >= self._start_at_us and not self.failed_at_start:
             self._received_us = now_us + _STARTS_WITHIN_US
             try:
@@ -334,7 +334,7 @@ class DriverEnd:
             )
             ours.send(setup.model_dump_json().encode())
             ends = (theirs.fileno(), their_aside.fileno())
-            # The child inherits the mask, so that no signal interrupts its imports; later it ignores these signals.
+            # The child inherits the mask, so that no signal interrupts its imports. Later it ignores these signals.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, EXIT_SIGNALS)
             unmask.callback(signal.pthread_sigmask, signal.SIG_SETMASK, before)
             self._process = subprocess.Popen(_command(ends), pass_fds=ends, stdin=subprocess.DEVNULL)
@@ -350,40 +350,40 @@ class DriverEnd:
     def _on_exit(self, code: int, now_us: int) -> None:
         self._process, self._gone_us = None, 0
         self._close_sockets()
-        if not self._was_ready:  # it reported why itself
+        if not self._was_ready:  # the process has reported the reason
             self.failed_at_start, self.exit_code = True, code if code > 0 else 1
             return
-        if code == CAMERA_EXIT:  # each time later, because a restart also interrupts the link
+        if code == CAMERA_EXIT:  # later each time, because a restart also interrupts the link
             self._camera_patience_us = min(2 * self._camera_patience_us, _LONGEST_PATIENCE_US)
         _log.info("network process ended (%s); starting it again", "camera" if code == CAMERA_EXIT else code)
         self._start_at_us = now_us + self._backoff_us
         self._backoff_us = min(2 * self._backoff_us, _LONGEST_BACKOFF_US)
 
     def on_ready(self) -> None:
-        """Note that its endpoint is open. From now on it is restarted after each end."""
+        """Note that the endpoint of the process is open. From now on it is restarted after each end."""
         self._was_ready = self._is_ready = True
         self._backoff_us = _FIRST_BACKOFF_US
 
     def on_camera(self, fault: str) -> None:
-        """Note why no image comes, "" while images come."""
+        """Note why no image comes, or "" while images come."""
         self._camera_fault = fault
         if not fault:
             self._camera_patience_us = _FIRST_PATIENCE_US
 
     def send(self, packet: bytes) -> None:
-        """Hand over a packet or drop it: a network process that does not read must not slow the driver.
+        """Send a packet or drop it, because a network process that does not read must not slow the driver.
 
-        One that still starts would publish a status of then as if it were new.
+        A process that is still starting would publish an old status as new, so it receives nothing.
         """
         if self._is_ready:
             _send_or_drop(self.socket, packet)
 
     def send_aside(self, packet: bytes) -> None:
-        """Send a packet that does not wake the driver. The driver reads it when it needs it."""
+        """Send a packet that does not wake the network process, which reads it when it needs it."""
         _send_or_drop(self._aside, packet)
 
     def packets(self) -> Iterator[bytes]:
-        """Yield a bounded number of packets, those that were sent aside first."""
+        """Yield a bounded number of packets, first those of `aside`."""
         arrived = list(self._arrived())
         for _ in range(_PACKETS_ASIDE):
             packet = _receive(self._aside) if self._aside else None
@@ -400,7 +400,7 @@ class DriverEnd:
                 yield packet
             elif packet is None:
                 return
-            elif self.socket:  # it is gone, and all that it sent is read
+            elif self.socket:  # the process is gone, and all its packets are read
                 self.socket.close()
                 self.socket = None
 
@@ -411,7 +411,7 @@ class DriverEnd:
         self.socket = self._aside = None
 
     def close(self) -> None:
-        """End it: it leaves when its socket closes, and is killed if it does not within a second."""
+        """End the network process: close its socket, and kill it if it does not end within a second."""
         self._close_sockets()
         if self._process is None:
             return
@@ -423,7 +423,7 @@ class DriverEnd:
 
 
 def _command(ends: Sequence[int]) -> list[str]:
-    folders = [one for one in sys.path if isinstance(one, str)]  # Python ignores all else that a plug-in puts there
+    folders = [one for one in sys.path if isinstance(one, str)]  # Python ignores other types in the list
     return [sys.executable, "-P", "-c", _CHILD, *map(str, ends), json.dumps(folders)]
 
 
@@ -442,6 +442,6 @@ def _receive(end: socket.socket) -> bytes | None:
             return end.recv(MAX_PACKET_BYTES)
         except BlockingIOError:
             return None
-        except OSError:  # that it left packets of ours unread is reported first, once; what it sent still waits
+        except OSError:  # unread packets of the driver cause one error first; packets of the process may follow
             continue
     return b""

@@ -1,4 +1,4 @@
-"""The robot's kinds of devices, each a plug-in found by entry-point name or `package.module:Name`. Shell."""
+"""The device groups of the robot. A plug-in is found by entry point or `package.module:Name`. Shell."""
 
 from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
@@ -14,7 +14,7 @@ Port = TypeVar("Port")
 
 @dataclass(frozen=True)
 class DeviceGroup(Generic[Port]):
-    """One kind of device: its key in the robot's configuration, what it must be able to do, its entry points."""
+    """One kind of device: its key in the robot's configuration, its port, its entry points."""
 
     key: str
     port: type[Any]
@@ -29,7 +29,7 @@ class DeviceGroup(Generic[Port]):
 
         Raises:
             ConfigError: for an unknown kind (nearest named), a missing package, method or wrong option.
-            HardwareError: as the device itself does, and for any other exception of it.
+            HardwareError: from the device, or for any other exception of it.
         """
         plugin, config = self.load(choice)
         try:
@@ -57,7 +57,7 @@ class DeviceGroup(Generic[Port]):
 
     @property
     def noun(self) -> str:
-        """Return the name of this kind of device in texts."""
+        """Return the name of this kind of device for texts."""
         return self.key.replace("_", " ")
 
     def load(self, choice: PluginChoice) -> tuple[Any, Any]:

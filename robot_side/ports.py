@@ -33,13 +33,13 @@ class Picture:
 
 
 def check_image(camera: Camera, picture: object) -> None:
-    """Raise TypeError or ValueError, with what is wrong, for an image or attributes that no `Camera` may have."""
+    """Raise TypeError or ValueError, with the error, for an invalid image or an invalid attribute of its `Camera`."""
     if not isinstance(picture, Picture):
         raise TypeError(f"read() returned {type(picture).__name__}; expected Picture or None")
     for name, value, kind in (
         ("Picture.jpeg", picture.jpeg, bytes | bytearray), ("Picture.t_us", picture.t_us, int),
         ("Picture.scale_percent", picture.scale_percent, int), ("model", camera.model, CameraModel),
-        ("live", camera.live, object),  # anything, but it must be there
+        ("live", camera.live, object),  # any value, but it must exist
     ):
         if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
             raise TypeError(f"{name} is {type(value).__name__}; expected {getattr(kind, '__name__', kind)}")
@@ -63,7 +63,7 @@ class WheelAngles:
 
 
 def check_wheels(reading: object) -> None:
-    """Raise TypeError, with what is wrong, for what no `Drive` may return from `wheels`."""
+    """Raise TypeError, with the error, for an invalid result of `Drive.wheels`."""
     if reading is not None and not isinstance(reading, WheelAngles):
         raise TypeError(f"wheels() returned {type(reading).__name__}; expected WheelAngles or None")
 
@@ -103,11 +103,11 @@ class Ranges:
 
 
 MAX_RAYS: Final = 16_384
-"""Of a scan: more of them would hold up the control loop."""
+"""Largest number of rays of a scan; more would delay the control loop."""
 
 
 def check_scan(scan: object) -> None:
-    """Raise TypeError or ValueError, with what is wrong, for what no `RangeSensor` may return."""
+    """Raise TypeError or ValueError, with the error, for an invalid result of `RangeSensor.read`."""
     if not isinstance(scan, Ranges):
         raise TypeError(f"read() returned {type(scan).__name__}; expected Ranges or None")
     if not isinstance(scan.t_us, int):
@@ -169,10 +169,10 @@ class Drive(Protocol):
 
     @staticmethod
     def zero(config: Mapping[str, Any]) -> None:
-        """Set the motors to zero without a drive: the process that had it is dead, and its end released the device.
+        """Set the motors to zero without a drive object. Its process is dead and has released the device.
 
-        The guardian calls it. It imports only the module of this function; without pydantic there it stays small. If
-        the module has a function `prepare`, the guardian calls it at its start, e.g. to import a library.
+        The guardian calls this function. It imports only the module of this function. Without pydantic the guardian
+        stays small. If the module has `prepare`, the guardian calls it at its start, e.g. to import a library.
 
         Args:
             config: the `Config` of the drive as plain values, `Config.model_dump(mode="json")`.

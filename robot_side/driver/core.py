@@ -40,8 +40,8 @@ _RETURNS_NO_CREDIT = (
     RejectReason.NOT_PROVEN,
 )  # fmt: skip
 
-_AHEAD_US = 1_000_000  # a reading of the wheels with a later time comes from another clock: no later one would be newer
-_WIRE_LIMIT = 1e6  # of every number on the wire: an encoder that wraps around must not end anything
+_AHEAD_US = 1_000_000  # a wheel reading further in the future has another clock, and would make later readings old
+_WIRE_LIMIT = 1e6  # limit of any number on the wire: an encoder that wraps around must not cause an error
 
 
 def _bounded(pair: Planar) -> Planar:
@@ -73,16 +73,16 @@ class DriverCore:
         self.tick_late_max_us = 0
         self.network_restarts = 0
         self.rejected_by_transport: Counter[str] = Counter()
-        """How often the transport rejected something before the gate, by reason."""
+        """Number of messages that the transport rejected before the gate, by reason."""
         self.faults: Counter[str] = Counter()
-        """How often each part raised an exception, in this process and in the network processes."""
+        """Number of exceptions in each part, in this process and in the network processes."""
         self.latch_failed = ""
-        """Why the STOP latch is not on disk as it should be, or empty."""
+        """Why the disk does not have the current STOP latch, or empty."""
         self._seqs: dict[str, int] = {}
         self._due_us: dict[str, int] = {}
         self._outbox: list[Message] = []
 
-    # --- what arrives --------------------------------------------------------------------------------------------
+    # --- inputs --------------------------------------------------------------------------------------------------
 
     def on_issued(self, seq: int, t_us: int, fingerprint: int) -> None:
         """Record a frame before the network process publishes it.
@@ -90,13 +90,13 @@ class DriverCore:
         Args:
             seq: number of the frame.
             t_us: capture time, us.
-            fingerprint: of the image bytes; 0 without one.
+            fingerprint: checksum of the image bytes; 0 without one.
         """
         self.gate.issued.add("frame", seq, t_us)
         self.gate.pictures.add(t_us, fingerprint)
 
     def on_twist(self, message: Message, now_us: int) -> CommandAck | None:
-        """Decode and offer a command. Returns its credit, if it answers a frame of this robot."""
+        """Decode a command and offer it to the gate. Returns its credit, if it answers a frame of this robot."""
         try:
             check_sizes(message.channel, message.header, message.payload)
             header = decode(AnswerHeader, message.header) if message.header else None
@@ -123,7 +123,7 @@ class DriverCore:
             self.battery.see(volts, t_us)
 
     def on_request(self, message: Message, now_us: int) -> None:
-        """Carry out a request; the reply waits in `messages`."""
+        """Apply a request; the reply waits in `messages`."""
         try:
             check_sizes(message.channel, message.header, message.payload)
             header = decode(RequestHeader, message.header)
@@ -141,10 +141,10 @@ class DriverCore:
         reply = Reply(to=header.digest, id=request.id, ok=granted, state=self.gate.state, detail=detail)
         self._post(REPLY, reply, now_us)
 
-    # --- what leaves ---------------------------------------------------------------------------------------------
+    # --- outputs -------------------------------------------------------------------------------------------------
 
     def tick(self, now_us: int, wheels: WheelAngles | None, scan: Ranges | None) -> tuple[float, float]:
-        """Read the sensors' news, step the gate, and return (left, right) rad/s for the motors.
+        """Process the sensor readings, step the gate, and return (left, right) rad/s for the motors.
 
         Raises:
             ValueError: an angle is not finite, or its time is in the future.
@@ -159,7 +159,7 @@ class DriverCore:
         return wheel_speeds(self.config.wheels, decision.twist)
 
     def motion(self) -> RobotMotion:
-        """Return the motion of the robot at this moment, for frame headers."""
+        """Return the current motion of the robot, for frame headers."""
         applied = self.gate.applied
         return RobotMotion(
             _bounded_pose(self.odometer.pose),
@@ -178,10 +178,10 @@ class DriverCore:
         yield from outbox
 
     def status(self, now_us: int) -> Status:
-        """Everything that an operator needs to know why the robot moves or does not."""
+        """Return all data that explains to an operator why the robot moves or stands."""
         gate, limits, holder = self.gate, self.config.safety, self.gate.holder(now_us)
         return Status(
-            # Wheels of an earlier process may turn, whatever `applied` is: no STOP may count as carried out.
+            # Wheels of an earlier process may turn, whatever `applied` is, so no STOP may count as applied.
             state=gate.state if gate.is_taken else State.FAULT,
             reason=self._reason(),
             holder=LeaseHolder.of(holder.source, holder.session) if holder else None,
@@ -227,7 +227,7 @@ class DriverCore:
 
     def _reason(self) -> str:
         stored = f"; not stored for a restart: {self.latch_failed}" if self.latch_failed else ""
-        is_known = self.gate.is_taken or self.gate.state is State.FAULT  # of the drive, by the reason of the gate
+        is_known = self.gate.is_taken or self.gate.state is State.FAULT  # the gate's reason already names the drive
         more = stored if is_known else f"; the drive takes no speeds{stored}"
         return (self.gate.reason[: 200 - len(more)] + more)[:200]
 

@@ -12,11 +12,11 @@ from sightline.protocol.log import count_fault
 
 _log: Final = logging.getLogger(__name__)
 
-_NO_SYNC: Final = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)  # of a folder, on some file systems in user space
+_NO_SYNC: Final = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)  # for a folder, on some user-space file systems
 
 
 class StopLatch:
-    """A mark per robot: there while it is STOPPED."""
+    """A mark file for each robot, which exists while the robot is STOPPED."""
 
     def __init__(self, directory: Path, robot: str) -> None:
         self._path = home_path(directory) / f"{robot}.stopped"
@@ -26,7 +26,7 @@ class StopLatch:
             raise ConfigError(f"state_dir {directory}: {error.strerror}; choose a writable directory") from None
 
     def is_set(self) -> bool:
-        """Return True if the robot was STOPPED when it last ran. Raises ConfigError where that is not known."""
+        """Return True if the robot was STOPPED when it last ran. Raises ConfigError if this is unknown."""
         try:
             self._path.lstat()
         except FileNotFoundError:
@@ -36,7 +36,7 @@ class StopLatch:
         return True
 
     def write(self, stopped: bool) -> None:
-        """Write or remove the mark; once this returns not even a power cut changes it. May wait for the disk."""
+        """Write or remove the mark. After the return it survives a power cut. May wait for the disk."""
         if stopped:
             with self._path.open("ab") as mark:
                 os.fsync(mark.fileno())
@@ -45,7 +45,7 @@ class StopLatch:
         self._sync_folder()
 
     def _sync_folder(self) -> None:
-        """Write the folder to disk. The mark is an entry in it, which is not written with the file."""
+        """Write the folder to disk, because its entry for the mark is not written with the file."""
         folder = os.open(self._path.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:
             os.fsync(folder)
@@ -61,18 +61,18 @@ _CLOSE_S: Final = 1.0
 
 
 class LatchWriter:
-    """Writes the STOP latch as last wanted, on a thread of its own: the disk must not hold up the loop.
+    """Writes the newest requested STOP latch on a separate thread, because the disk must not block the loop.
 
-    The latch is a level: a write that fails is tried again until the disk has it.
+    The latch is a level: a failed write is repeated until it succeeds.
     """
 
     def __init__(self, latch: StopLatch) -> None:
         self._latch = latch
         self._wanted = latch.is_set()
         self._stored: bool | None = self._wanted
-        """What is on disk; None where that is not known: a write failed half-way."""
+        """State on disk; None if unknown after a write that failed half-way."""
         self.failed = ""
-        """Why the disk does not have what is wanted, while that lasts."""
+        """Why the disk does not have the requested state, or empty."""
         self._changed = threading.Event()
         self._closing = False
         self._thread = threading.Thread(target=self._write_all, name="latch", daemon=True)
@@ -80,17 +80,17 @@ class LatchWriter:
 
     @property
     def is_stored(self) -> bool:
-        """Return True if the disk has the mark of a STOP."""
+        """Return True if the mark of a STOP is on disk."""
         return self._stored is True
 
     def want(self, stopped: bool) -> None:
-        """Want the latch so; never waits."""
+        """Request a state of the latch; never waits."""
         if stopped is not self._wanted:
             self._wanted = stopped
             self._changed.set()
 
     def close(self) -> None:
-        """Write what is wanted, for a second at most. Idempotent: writes what was wanted since the last close."""
+        """Write the requested state, for one second at most. Idempotent: a later call writes later requests."""
         self._closing = True
         self._changed.set()
         self._thread.join(_CLOSE_S)

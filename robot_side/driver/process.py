@@ -59,32 +59,32 @@ _log: Final = logging.getLogger(__name__)
 
 # The driver process: owns gate and motors, is the parent of the network process, has no network. Shell.
 #
-# Motors latch, so the process that owns them must outlive every fault beside it. The network process may hang, die or
-# hold its interpreter lock for ever; this loop still reads its own clock 50 times a second and stops the wheels.
+# Motors keep their last speed, so their process must outlive every other fault. The network process may hang, die or
+# hold its interpreter lock forever. This loop still reads its own clock 50 times a second and stops the wheels.
 
 
 _SHUTDOWN_US = 2_000_000
 _MAX_CONFIG_BYTES = 1 << 20
-# The process locks its memory, a stack of the usual 8 MB with it. A plug-in's code needs more than ours.
+# The process locks its memory, including stacks of usually 8 MB. Plug-in code needs a larger stack than this code.
 _STACK_BYTES, _PLUGIN_STACK_BYTES = 256 * 1024, 1024 * 1024
 _BATTERY_PERIOD_S = 1.0
 _STOP_REPORT_US = 100_000
 _REOPENS_US = 1_000_000
 _INVALID: Final = (ValueError, KeyError, struct.error, WireError)
-"""Raised for a packet of a broken process, which is restarted."""
+"""Errors for a packet of a broken process, which is restarted."""
 
 
 def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
-    """Run the robot until one of the ENDING signals or until the guardian is gone; the wheels are then at zero.
+    """Run the robot until one of EXIT_SIGNALS or until the guardian is gone. The wheels are then at zero.
 
-    Raises ConfigError, HardwareError or LinkError before anything could move, and HardwareError if the drive failed to
-    set the motors to zero at the end.
+    Raises ConfigError, HardwareError or LinkError before any motion, and HardwareError if the drive failed to set the
+    motors to zero at the end.
     """
     check_robot_id(config.robot)
     limit_core_dump()
     is_restart = guardian is not None and guardian.is_restart
     if not is_restart:
-        check_ports(config.listen)  # before the devices: a robot that has the ports may have them too
+        check_ports(config.listen)  # before the devices: a second robot on these ports may own the devices, too
     with ExitStack() as last, ExitStack() as ending:
         drive: Drive = LostDrive(config.motors) if is_restart else DRIVES.build(config.motors)
         ending.callback(_close, "drive", drive)
@@ -98,20 +98,21 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
         threading.stack_size(_STACK_BYTES)
         start_log_thread()
         driver = Driver(config, drive, ranges, reader, guardian)
-        last.callback(driver.finish)  # again: devices and network process may take seconds to close
+        last.callback(driver.finish)  # once more, because closing devices and network process may take seconds
         threading.stack_size(_PLUGIN_STACK_BYTES)
         ending.callback(driver.latch_writer.close)
         ending.callback(driver.driver_end.close)
         ending.callback(driver.finish)
         if guardian is not None:
             guardian.wait()
-        # Last in, first to run: however the loop ends, the motors are set to zero. An error makes the guardian do it.
+        # Runs first, because the stack is last in, first out: every end sets the motors to zero, at least by the
+        # guardian after an error.
         ending.callback(_end, config, drive, guardian)
         return driver.loop()
 
 
 class LostDrive:
-    """The drive of a driver process that died. It is opened when it can be; until then an operator sees why not."""
+    """The drive of a driver process that died. It tries to open the drive; until then `status` shows the error."""
 
     def __init__(self, choice: PluginChoice) -> None:
         self._choice = choice
@@ -121,7 +122,7 @@ class LostDrive:
             self._opened()
 
     def set(self, left_rad_s: float, right_rad_s: float) -> None:
-        """Give wheel speeds, see `Drive`."""
+        """Set the wheel speeds, see `Drive`."""
         self._opened().set(left_rad_s, right_rad_s)
 
     def wheels(self) -> WheelAngles | None:
@@ -130,15 +131,15 @@ class LostDrive:
 
     @staticmethod
     def zero(config: Mapping[str, Any]) -> None:
-        """The guardian calls that of the drive itself."""
+        """Do nothing: the guardian calls `zero` of the real drive."""
 
     def close(self) -> None:
-        """Close the drive, if it is open."""
+        """Close the drive if it is open."""
         if self._drive is not None:
             self._drive.close()
 
     def _opened(self) -> Drive:
-        """Return the drive. Raises HardwareError while it does not open; a try each second."""
+        """Return the drive. Raises HardwareError until it opens. It tries once a second."""
         if self._drive is None:
             if heartbeat_us() < self._due_us:
                 raise HardwareError(self._why)
@@ -160,7 +161,7 @@ def _close(part: str, device: Drive | RangeSensor | Battery) -> None:
 
 
 def zero_motors(config: RobotConfig) -> int:
-    """Set the motors to zero without gate or network, to clean up after a dead robot service.
+    """Set the motors to zero without gate or network, after a robot service has died.
 
     Raises ConfigError for a drive without `zero`, HardwareError if the motors may still turn.
     """
@@ -170,7 +171,7 @@ def zero_motors(config: RobotConfig) -> int:
 
 
 def _end(config: RobotConfig, drive: Drive, guardian: GuardianEnd | None) -> None:
-    """Set the motors to zero, and send the guardian whether this process may take its time to end."""
+    """Set the motors to zero. The last heartbeat reports a failure to the guardian."""
     last_beat = FAILED
     try:
         _zero(config, partial(drive.set, 0.0, 0.0))
@@ -192,18 +193,18 @@ def _zero(config: RobotConfig, set_to_zero: Callable[[], None]) -> None:
 
 
 class BatteryReader:
-    """Reads the battery once a second on a thread of its own: a slow device must not hold up the loop."""
+    """Reads the battery once a second on a separate thread, because a slow device must not block the loop."""
 
     def __init__(self, battery: Battery) -> None:
         self._battery = battery
         self._closing = threading.Event()
         self.newest: tuple[float, int] | None = None
-        """Volts, and when they were read."""
+        """Voltage in V, and the time of its reading."""
         self._thread = threading.Thread(target=self._read_all, name="battery", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """End after the reading in progress. A reading that hangs is left behind after a second, its device open."""
+        """End after the current reading. It waits one second for a reading that hangs, and leaves its device open."""
         self._closing.set()
         self._thread.join(_BATTERY_PERIOD_S)
 
@@ -215,7 +216,7 @@ class BatteryReader:
 
     def _read_until_closing(self) -> None:
         while not self._closing.is_set():
-            begin_us = monotonic_us()  # a reading that hung is as old as its begin
+            begin_us = monotonic_us()  # the age of a reading counts from its start, also if it hung
             try:
                 self.newest = self._read(), begin_us
             except PLUGIN_ERRORS as error:
@@ -231,7 +232,7 @@ class BatteryReader:
 
 
 class Driver:
-    """The loop and what it holds."""
+    """The control loop and its state."""
 
     def __init__(
         self, config: RobotConfig, drive: Drive, ranges: RangeSensor | None,
@@ -244,7 +245,7 @@ class Driver:
         self._battery_reader = battery_reader
         self._logged_level = BatteryLevel.SILENT
         self._driver_core = DriverCore(config, secrets.token_hex(4), stopped=latch.is_set())
-        # The process before may have been disarmed, or have lost a human: only an operator arms again.
+        # The last process may have been disarmed, or have lost a human. Then only an operator may arm again.
         self._driver_core.gate.arms_itself &= guardian is None or not guardian.is_restart
         self._logged_state = self._driver_core.gate.state
         self._is_waiting_logged = False
@@ -254,7 +255,7 @@ class Driver:
         """Time of the last tick for a command."""
         self._speeds_are_set = False
         self._rejects_since_us = 0
-        """Time since which the drive takes no speeds; 0 if it took the last ones."""
+        """Time since which the drive rejects speeds; 0 if it accepted the last ones."""
         self._scan_layout: tuple[float, ...] = ()
         self._command_acks: list[ipc.CommandAck] = []
         self._rejection_limiter = RepeatLimiter()
@@ -263,24 +264,24 @@ class Driver:
         self.driver_end = DriverEnd(config, self._driver_core.session)
         self._stops = guardian.stops if guardian else None
         self._stop_applied = 0
-        """Number of the newest STOP of the receiver that is latched."""
+        """Number of the receiver's newest STOP that is latched."""
         self._stop_report, self._stop_report_us = b"", 0
         for number in EXIT_SIGNALS:
             signal.signal(number, self._on_signal)
         for number in IGNORED_SIGNALS:
             signal.signal(number, signal.SIG_IGN)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, EXIT_SIGNALS)  # a guardian starts us with them blocked
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, EXIT_SIGNALS)  # a guardian starts this process with them blocked
 
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
         self._ending_since_us = self._ending_since_us or monotonic_us()
 
     def loop(self) -> int:
-        """Tick when a command arrives, at most once in MIN_TICK_US, and 20 ms after the tick before.
+        """Tick when a command arrives, at most once in MIN_TICK_US, and 20 ms after the last tick.
 
-        So no tick is running when the next command arrives: at 30 images a second, 13 ms after the last one.
+        At 30 fps the next command arrives 13 ms after that second tick, so no tick is running then.
         """
         self._log_missing()
-        # Deadlines have the clock of heartbeats: a robot that slept is not late.
+        # Deadlines use the clock of the heartbeats, so that a suspended robot is not late.
         deadline_us = heartbeat_us()
         is_pending = False
         while not self._ended():
@@ -303,7 +304,7 @@ class Driver:
         return self.driver_end.exit_code
 
     def finish(self) -> None:
-        """Latch and answer what arrived so far. The motors are at zero."""
+        """Latch and answer the messages so far. The motors are at zero."""
         self._drain()
         now_us = monotonic_us()
         for message in self._driver_core.messages(now_us):
@@ -312,7 +313,7 @@ class Driver:
         self._report_stop(now_us)
 
     def _log_missing(self) -> None:
-        """Log what this robot lacks before it moves."""
+        """Log missing capabilities of this robot before it moves."""
         for line in request_real_time(DRIVER_PRIORITY):
             self._log(line)
 
@@ -329,7 +330,7 @@ class Driver:
         return self._driver_core.at_rest and self._speeds_are_set
 
     def _heartbeat(self) -> bytes:
-        """Return what the guardian must know of the wheels."""
+        """Return the state of the wheels for the guardian."""
         rejects = self._rejects_since_us and heartbeat_us() - self._rejects_since_us >= REJECTS_US
         if rejects and not self._driver_core.at_rest:
             return LOST if self._ending_since_us is None else FAILED
@@ -365,7 +366,7 @@ class Driver:
         self._report_stop(now_us)
 
     def _answer(self) -> None:
-        """Send command acks once the wheels are set; motion first, for the frame that an ack permits carries it.
+        """Send command acks after the wheels are set. The motion comes first, for the header of the next frame.
 
         Next: `robot_side/network/process.py`: `NetworkProcess._on_packet`.
         """
@@ -375,9 +376,9 @@ class Driver:
             self.driver_end.send(ipc.pack_command_ack(ack))
 
     def _move(self) -> None:
-        """Sensors, gate, motors. Whatever a device raises stops the robot, never the loop that stops it.
+        """Run sensors, gate and motors. An error of a device stops the robot but not this loop.
 
-        The gate's time is taken after the sensors': a scan that is stamped when it is read is not from the future.
+        The gate's time is read after the sensors, so that a scan stamped at its reading is not from the future.
         Next: `robot_side/hardware/gpio.py`: `GpioDrive.set`.
         """
         wheels: WheelAngles | None = None
@@ -393,9 +394,9 @@ class Driver:
             if self._battery_reader is not None and self._battery_reader.newest is not None:
                 self._driver_core.on_battery(*self._battery_reader.newest)
             speeds = self._driver_core.tick(monotonic_us(), wheels, scan)
-        except BlindZoneError:  # with the first scan, and without one nothing moves
+        except BlindZoneError:  # from the first scan; without a scan the robot does not move
             raise
-        except PLUGIN_ERRORS as error:  # a plug-in is foreign code; a reading may be no number
+        except PLUGIN_ERRORS as error:  # third-party code; a reading may have any type
             self._fault(part, error)
             speeds = self._without_sensors()
         try:
@@ -412,7 +413,7 @@ class Driver:
         self._driver_core.gate.fault(fault_text(part, error))
 
     def _without_sensors(self) -> tuple[float, float]:
-        """Return the gate's ramp to zero, or zero if the gate cannot step either, because this loop must not end."""
+        """Return the gate's ramp to zero, or zero if the gate fails too, because this loop must not end."""
         try:
             return self._driver_core.tick(monotonic_us(), None, None)
         except Exception as error:
@@ -421,7 +422,7 @@ class Driver:
             return 0.0, 0.0
 
     def _scanned(self) -> Ranges | None:
-        """Return the newest scan. Raises BlindZoneError for a sensor that the guard must not rely on."""
+        """Return the newest scan. Raises BlindZoneError for a sensor whose blind zone is too large for the guard."""
         scan = self._ranges.read() if self._ranges else None
         if scan is None:
             return None
@@ -437,7 +438,7 @@ class Driver:
         logged, self._logged_state = self._logged_state, state
         self._is_waiting_logged &= state is State.DISARMED
         if state is not logged and {state, logged} != {State.ACTIVE, State.DEGRADED}:
-            self._log(f"{state} ({reason})")  # on a lossy link those two alternate many times a second
+            self._log(f"{state} ({reason})")  # on a lossy link ACTIVE and DEGRADED alternate many times a second
 
     def _log_battery(self, now_us: int) -> None:
         """Log each change of level in one line."""
@@ -456,7 +457,7 @@ class Driver:
     # --- packets of the network process --------------------------------------------------------------------------
 
     def _drain(self) -> bool:
-        """Handle what the network process and the STOP receiver sent; True if a command was among it."""
+        """Handle packets of the network process and the STOP receiver. Returns True if a command was among them."""
         commanded = False
         for packet in read_packets(self._stops) if self._stops else ():
             with suppress(*_INVALID):
@@ -467,7 +468,7 @@ class Driver:
         return commanded
 
     def _on_receiver_packet(self, packet: bytes) -> bool:
-        """Handle a packet of the STOP receiver; True for a STOP. Next: `SafetyGate.stop`."""
+        """Handle a packet of the STOP receiver. Returns True for a STOP. Next: `SafetyGate.stop`."""
         if packet.startswith(b"S"):
             self._driver_core.gate.stop("STOP by a datagram")
             self.latch_writer.want(True)
@@ -483,7 +484,7 @@ class Driver:
         return False
 
     def _report_stop(self, now_us: int) -> None:
-        """Send the STOP receiver the state, when it changes and ten times a second."""
+        """Send the state to the STOP receiver, when it changes and ten times a second."""
         if self._stops is None:
             return
         state, stored = self._driver_core.gate.state, self.latch_writer.is_stored
@@ -513,7 +514,7 @@ class Driver:
         return False
 
     def _on_rejected(self, counts: dict[str, int]) -> None:
-        """Counts of this network process, which begins at zero; ours go on over its restarts."""
+        """Add new counts of this network process. They start at zero; the sums continue across its restarts."""
         more, self._rejected_by_network = Counter(counts) - self._rejected_by_network, Counter(counts)
         self._driver_core.rejected_by_transport += more
         for reason, count in more.items():
@@ -527,14 +528,14 @@ class Driver:
                 self._command_acks.append(ack)
         elif message.channel is REQUEST:
             self._driver_core.on_request(message, monotonic_us())
-            self.latch_writer.want(self._driver_core.gate.state is State.STOPPED)  # the loop may end before its tick
+            self.latch_writer.want(self._driver_core.gate.state is State.STOPPED)  # the loop may end before the tick
         rejection = self._driver_core.gate.last_rejection
         if rejection is not None and rejection is not rejection_before:
             self._log_rejection(rejection.source, rejection.reason, rejection.detail)
         return True
 
     def _log_rejection(self, source: str, reason: str, detail: str, times: int = 1) -> None:
-        # A driver sends commands before it is armed: a normal state, and one line shows how it ends.
+        # A driver that sends commands before it is armed is a normal state. One line shows how it ends.
         if reason == RejectReason.DISARMED:
             if not self._is_waiting_logged:
                 self._is_waiting_logged, robot = True, self._driver_core.config.robot
@@ -546,7 +547,7 @@ class Driver:
 
 
 def main() -> None:
-    """Run a driver process that a guardian started. Its arguments are the descriptors of their sockets."""
+    """Run a driver process that a guardian started. The arguments are the descriptors of its sockets."""
     heartbeats, *stops = (socket.socket(fileno=int(number)) for number in sys.argv[1:])
     try:
         start_log(None, "robot")

@@ -10,26 +10,26 @@ from collections.abc import Iterator
 from typing import Final
 
 EXIT_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
-"""Whatever a key or a terminal can send ends it by way of zero, Ctrl-\\ and Ctrl-Z too: a driver that is killed or held
-up on the spot leaves the wheels turning."""
+"""Signals from keys and terminals, with Ctrl-\\ and Ctrl-Z. The driver first sets the wheels to zero and then ends,
+because a driver that is killed or stopped leaves the wheels turning."""
 IGNORED_SIGNALS: Final = (signal.SIGTTIN, signal.SIGTTOU)
-"""Nor may a terminal that it is in the background of hold it up."""
+"""Signals that would stop a process in the background of a terminal."""
 
 
-# What the driver process requests of the operating system: punctuality, and a watchdog. Shell.
+# Requests of the driver process to the operating system: real-time scheduling, and a watchdog. Shell.
 #
-# Each part that is not permitted is logged once at start; the robot runs without it.
+# A part without permission is logged once at start. The robot runs without it.
 
 
-# Above ordinary threads and the kernel's own soft work, below its watchdogs. The guardian ends a driver in a loop.
+# Above ordinary threads and kernel soft interrupts, below kernel watchdogs. The guardian ends a driver in a loop.
 DRIVER_PRIORITY: Final = 50
 GUARDIAN_PRIORITY: Final = 51
 _MCL_CURRENT_AND_FUTURE: Final = 3
-_MCL_ONFAULT: Final = 4  # only what is in use, so that it does not grow
+_MCL_ONFAULT: Final = 4  # lock used pages only, so that the process does not grow
 
 
 def schedule_real_time(priority: int, thread: int = 0) -> bool:
-    """Request real-time scheduling for a thread, not for what it starts. Returns False if it is not permitted."""
+    """Request real-time scheduling for a thread, not for its children. Returns False if it is not permitted."""
     try:
         os.sched_setscheduler(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except (OSError, AttributeError):
@@ -38,7 +38,7 @@ def schedule_real_time(priority: int, thread: int = 0) -> bool:
 
 
 def request_real_time(priority: int) -> Iterator[str]:
-    """Freeze the garbage collector's survivors, request real-time scheduling and locked memory; yields what failed."""
+    """Freeze the garbage collector, request real-time scheduling, lock the memory. Yields the failures."""
     gc.collect()
     gc.freeze()
     if not schedule_real_time(priority):
@@ -50,9 +50,9 @@ def request_real_time(priority: int) -> Iterator[str]:
 
 
 def limit_core_dump() -> None:
-    """Write no core dump of this process: the motors would keep their speed until the last byte is on the disk."""
+    """Disable core dumps. During a dump the motors would keep their speed until it is on disk."""
     hard = resource.getrlimit(resource.RLIMIT_CORE)[1]
-    # Not 0: a dump into a program ignores that value. Source: core(5).
+    # Not 0, because a dump into a program ignores 0. Source: core(5).
     resource.setrlimit(resource.RLIMIT_CORE, (1 if hard else 0, hard))
 
 
@@ -75,4 +75,4 @@ class SystemdNotifier:
             try:
                 self._socket.sendto(state.encode(), socket.MSG_DONTWAIT, self._address)
             except OSError:
-                return  # the watchdog will notice the silence
+                return  # the watchdog detects the silence

@@ -1,41 +1,41 @@
-"""When a driver process counts as hung, and whether it is started again. Pure; standard library only.
+"""Decide when a driver process counts as hung, and whether to start it again. Pure; standard library only.
 
-A heartbeat is a byte and its time, which the control loop sends at each tick. Silence is measured in the driver's own
-time, without the time that the driver waited for a processor, and without the lateness of the guardian itself.
+A heartbeat is a byte and its time. The control loop sends one at each tick. Silence is measured in the driver's own
+time, without the time that the driver waited for a processor, and without delays of the guardian itself.
 """
 
 from collections import deque
 from typing import Final
 
 AT_REST: Final = b"0"
-"""Heartbeat of a loop whose wheels are at zero."""
+"""Heartbeat: the wheels are at zero."""
 MOVING: Final = b"1"
-"""Heartbeat of a loop whose wheels turn."""
+"""Heartbeat: the wheels turn."""
 LOST: Final = b"l"
-"""Heartbeat of a loop whose wheels turn while its drive takes no speeds, so only the guardian can stop them."""
+"""Heartbeat: the wheels turn and the drive rejects speeds, so only the guardian can stop them."""
 IDLE: Final = b"i"
-"""The wheels are at zero, and the next heartbeat may take as long as an operator thinks."""
+"""The wheels are at zero, and the next heartbeat may wait for an operator."""
 WATCHED: Final = b"w"
-"""What a guardian sends to a driver process once it watches it."""
+"""Message of a guardian to a driver process that it watches from now on."""
 ENDING: Final = b"e"
 """The last heartbeat: the wheels are at zero, and files and devices are being closed."""
 FAILED: Final = b"f"
-"""The last heartbeat: the drive did not take zero at the end, so only the guardian can stop the wheels."""
+"""The last heartbeat: the drive rejected zero at the end, so only the guardian can stop the wheels."""
 
 PERIOD_US: Final = 100_000
-"""Between two looks at a driver: each wakes the guardian, and the end of a driver wakes it without a look."""
+"""Time between two checks of a driver. Each check wakes the guardian. The end of a driver wakes it without a check."""
 LATE_US: Final = 25_000
-"""Silence of a driver that is late, and then the time between two looks; the loop sends a heartbeat within 20 ms."""
+"""Silence of a late driver, and then the time between two checks. The loop sends a heartbeat within 20 ms."""
 HUNG_US: Final = 200_000
 """Silence in the driver's own time after which it counts as hung."""
 REJECTS_US: Final = 100_000
-"""Time in which a drive takes no speeds after which turning wheels count as out of control."""
+"""Time for which a drive rejects speeds until turning wheels count as out of control."""
 STARVED_US: Final = 500_000
-"""Silence of a driver without a processor after which moving wheels are stopped: zero follows within 700 ms."""
+"""Silence of a driver without a processor, after which moving wheels are stopped. They are at zero within 700 ms."""
 STARTS_WITHIN_US: Final = 30_000_000
-"""Until the first heartbeat; a first start reads its packages from a slow card."""
+"""Longest time to the first heartbeat; a first start reads its packages from a slow card."""
 ENDS_WITHIN_US: Final = 7_000_000
-"""From the request to end: 2 s for the ramp to zero, then latch, network process and battery, each within a second."""
+"""Longest end after a request: 2 s for the ramp, then latch, network process and battery, each within a second."""
 MAX_RESTARTS: Final = 5
 RESTART_WINDOW_US: Final = 60_000_000
 
@@ -43,7 +43,7 @@ _OUT_OF_CONTROL: Final = {
     LOST: "its drive took no speeds for 100 ms",
     FAILED: "its drive did not take zero at the end",
 }
-_LONGEST_STEP_US: Final = PERIOD_US + LATE_US  # of one look: more of it is the lateness of the guardian
+_LONGEST_STEP_US: Final = PERIOD_US + LATE_US  # of one check; the rest is a delay of the guardian
 
 
 def pack_beat(kind: bytes, sent_us: int) -> bytes:
@@ -57,7 +57,7 @@ def unpack_beat(packet: bytes) -> tuple[bytes, int]:
 
 
 class HeartbeatMonitor:
-    """The silence of one driver process."""
+    """Measures the silence of one driver process."""
 
     def __init__(self, now_us: int) -> None:
         self._looked_us = now_us
@@ -67,31 +67,31 @@ class HeartbeatMonitor:
 
     @property
     def is_ready(self) -> bool:
-        """Return True after the first heartbeat. Before it the driver moved nothing."""
+        """Return True after the first heartbeat. Before it the driver has moved nothing."""
         return bool(self._last)
 
     @property
     def drive_failed(self) -> bool:
-        """Return True if the driver ends without having set the wheels to zero."""
+        """Return True if the driver ends without zero wheel speeds."""
         return self._last == FAILED
 
     @property
     def is_running(self) -> bool:
-        """Return True if the loop has not announced its end. A process that is gone then did not end in order."""
+        """Return True if the loop has not announced its end. The end of such a process is an error."""
         return self._last in (AT_REST, MOVING, LOST)
 
     @property
     def is_late(self) -> bool:
-        """Return True if a heartbeat is missing, so that `look` needs the processor time of the driver."""
+        """Return True if a heartbeat is missing, so `look` needs the processor time of the driver."""
         return self._silence_us >= LATE_US and self._last not in (b"", IDLE)
 
     def on_beat(self, kind: bytes, sent_us: int) -> None:
-        """Note a heartbeat. A driver that is ending does not come back to life."""
+        """Note a heartbeat. After ENDING, later heartbeats change nothing."""
         self._last = ENDING if self._last == ENDING else kind
         self._looked_us, self._silence_us, self._own_us, self._run_us = sent_us, 0, 0, None
 
     def look(self, now_us: int, run_us: int | None = None) -> str:
-        """Return why the driver must be killed, or "" while it need not.
+        """Return why the driver must be killed, or "".
 
         Args:
             now_us: monotonic time, us.
@@ -142,7 +142,7 @@ def exit_code_after(code: int, end_signal: int | None, *, was_running: bool) -> 
     Args:
         code: exit code of the driver; negative if a signal ended it.
         end_signal: the signal that requested the end of the robot, or None.
-        was_running: True if its loop had not announced its end: a plug-in's library ended the process, whatever `code`.
+        was_running: True if its loop had not announced its end: a library of a plug-in ended the process.
     """
     if end_signal is None:
         return None if code < 0 or was_running else code

@@ -1,7 +1,7 @@
-"""The guardian process: watches the heartbeats of a driver process, kills it if it hangs, stops the wheels. Shell.
+"""The guardian process: watches a driver process, kills it if it hangs, stops the wheels. Shell.
 
-It has the standard library and `zero` of the drive, nothing else, so that it is small and has little to fail. It opens
-no device while a driver process lives: a GPIO line has one owner, so it kills the driver and waits for its end first.
+It loads only the standard library and `zero` of the drive, so that it is small and can hardly fail. It opens no device
+while a driver process lives. A GPIO line has one owner, so the guardian kills the driver and waits for its end first.
 """
 
 import ctypes
@@ -66,7 +66,7 @@ _DRIVER: Final = (
 
 
 class Guardian:
-    """One robot's guardian. `setup` is what `start.become_guardian` wrote."""
+    """The guardian of one robot. `setup` is the data of `start.become_guardian`."""
 
     def __init__(self, setup: dict[str, Any]) -> None:
         self._setup = setup
@@ -86,9 +86,9 @@ class Guardian:
         self._driver_pid: int = setup["pid"]
         self._status: int | None = None
         self._reason = ""
-        """Why the driver process was killed, "" if it ended by itself."""
+        """Why the driver process was killed, "" if it ended without being killed."""
         self._zero_failed: BaseException | None = None
-        """Why the motors could not be set to zero after the last driver process."""
+        """Error of the last attempt to set the motors to zero, or None."""
         self._monitor = HeartbeatMonitor(heartbeat_us())
         self._budget = RestartBudget()
         self._end_signal: int | None = None
@@ -107,11 +107,11 @@ class Guardian:
         self._send_ready()
         while True:
             code = os.waitstatus_to_exitcode(self._watch())
-            if self._monitor.drive_failed:  # the same whether the driver process was killed or quicker
+            if self._monitor.drive_failed:  # also if it ended before the guardian could kill it
                 code = _HARDWARE_EXIT
             needs_zero_now = self._needs_zero(code)
             self._zero_failed = self._set_to_zero() if needs_zero_now else None
-            self._log_end(code, was_zeroed=needs_zero_now)  # after zero: its thread has no real-time priority
+            self._log_end(code, was_zeroed=needs_zero_now)  # after zero: the log thread has no real-time priority
             self._kill_orphans()
             exit_code = exit_code_after(code, self._end_signal, was_running=self._monitor.is_running)
             if exit_code is not None:
@@ -137,7 +137,7 @@ class Guardian:
             self._log_line("the motors are set to zero")
 
     def _needs_zero(self, code: int) -> bool:
-        """Return True if the wheels may turn, maybe since an earlier process. One that ends with 0 stopped them."""
+        """Return True if the wheels may turn, also since an earlier process. An end with code 0 has stopped them."""
         is_needed = needs_zero(code, was_ready=self._monitor.is_ready, was_running=self._monitor.is_running)
         return is_needed or (self._zero_failed is not None and code != 0)
 
@@ -148,7 +148,7 @@ class Guardian:
     # --- the driver process --------------------------------------------------------------------------------------
 
     def _watch(self) -> int:
-        """Wait until the driver process has ended, by itself or killed. Returns its wait status."""
+        """Wait until the driver process has ended or was killed. Returns its wait status."""
         self._status, self._reason = None, ""
         while True:
             self._hang_up.poll((LATE_US if self._monitor.is_late else PERIOD_US) // 1000)
@@ -176,12 +176,12 @@ class Guardian:
             self._receiver.keep_alive(heartbeat_us())
 
     def _send_ready(self) -> None:
-        """Permit the driver process to move: from now on its end is noticed."""
+        """Permit the driver process to move, because the guardian now detects its end."""
         with suppress(OSError):
             self._beats.send(WATCHED)
 
     def _read_beats(self, now_us: int) -> bool:
-        """Take what the driver process sent. Returns False after the end of its socket."""
+        """Read the heartbeats of the driver process. Returns False after the end of its socket."""
         for _ in range(_BEATS_PER_LOOK):
             try:
                 packet = self._beats.recv(16)
@@ -197,7 +197,7 @@ class Guardian:
     def _on_beat(self, kind: bytes, sent_us: int, now_us: int) -> None:
         if not self._monitor.is_ready:
             self._permit_silence(os.environ.get("WATCHDOG_USEC", ""))
-            # Once, after the lines of a driver process that does not start. An operator watches a tool.
+            # Logged once, after the lines of the driver's start. Without restarts an operator watches the process.
             if not self._fed_us and self._setup["driver"] is not None:
                 self._log_line(_NOT_COVERED.format("" if self._systemd.is_active else _NO_WATCHDOG))
         self._monitor.on_beat(kind, sent_us)
@@ -208,12 +208,12 @@ class Guardian:
             self._systemd.notify("READY=1\nWATCHDOG=1")
 
     def _permit_silence(self, watchdog_us: str | int) -> None:
-        """Set the time of the watchdog of systemd, which is longer while a new driver process starts."""
+        """Set the time of the systemd watchdog. It is longer while a new driver process starts."""
         if os.environ.get("WATCHDOG_USEC") and watchdog_us:
             self._systemd.notify(f"WATCHDOG_USEC={watchdog_us}")
 
     def _set_to_zero(self) -> BaseException | None:
-        """Call `zero` of the drive. Returns why it failed, after several tries: a dying owner may hold the device."""
+        """Call `zero` of the drive, several times if a dying owner holds the device. Returns the error or None."""
         for _ in range(_ZERO_TRIES):
             failed: list[BaseException] = []
             calling = threading.Thread(target=self._call_zero, args=(failed,), name="zero", daemon=True)
@@ -231,7 +231,7 @@ class Guardian:
         schedule_real_time(GUARDIAN_PRIORITY)
         try:
             self._zero(self._zero_config)
-        except (Exception, SystemExit) as error:  # foreign code
+        except (Exception, SystemExit) as error:  # third-party code
             failed.append(error)
 
     def _start_driver(self) -> None:
@@ -257,11 +257,11 @@ class Guardian:
         return pid
 
     def _kill_orphans(self) -> None:
-        """Kill what a dead driver process left: its network process holds the port and the camera."""
+        """Kill the children of a dead driver process: its network process holds the port and the camera."""
         receiver = {self._receiver.pid} if self._receiver else set()
         by_us = heartbeat_us() + _ORPHANS_END_US
         while (orphans := set(_children()) - receiver) and heartbeat_us() < by_us:
-            for pid in orphans:  # again and again: the children of a killed one become ours
+            for pid in orphans:  # repeatedly, because children of a killed process become children of this one
                 with suppress(OSError):
                     os.kill(pid, signal.SIGKILL)
             time.sleep(0.002)
@@ -269,7 +269,7 @@ class Guardian:
 
     def _reap(self) -> None:
         with suppress(ChildProcessError):
-            # A look with real-time priority first: without it, a driver process in an endless loop would hold us up.
+            # Check with real-time priority first. Without it, a driver process in an endless loop would block this one.
             while os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None:
                 with without_real_time():
                     pid, status = os.waitpid(-1, os.WNOHANG)
@@ -299,8 +299,8 @@ class Guardian:
 def without_real_time() -> Iterator[None]:
     """Reap a child without real-time priority.
 
-    In `wait4`, Linux may turn until the last thread of the child has left `/proc`, where `run_us_of` looked at it. With
-    one processor and a lower priority that thread would never run again.
+    In `wait4`, Linux may spin until the last thread of the child has left `/proc`, which `run_us_of` reads. On a single
+    processor this thread has a lower priority and would never run again.
     """
     is_real_time = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
     if is_real_time:
@@ -314,7 +314,7 @@ def without_real_time() -> Iterator[None]:
 
 
 def _hang_up_of(beats: socket.socket) -> select.poll:
-    """Return what waits for the end of the process at the other end, and not for its heartbeats."""
+    """Return a poll object that reports the end of the other process, but not its heartbeats."""
     beats.setblocking(False)
     hang_up = select.poll()
     hang_up.register(beats, select.POLLRDHUP)
@@ -322,26 +322,26 @@ def _hang_up_of(beats: socket.socket) -> select.poll:
 
 
 def run_us_of(pid: int) -> int | None:
-    """Return the processor time of `pid`, us, if one of its threads is ready to run; None if none is.
+    """Return the processor time of `pid`, us, or None if none of its threads is ready to run.
 
-    All threads count: the control loop may wait for the interpreter's lock, which another thread holds that in turn
-    waits for a processor.
+    All threads count: the control loop may wait for the interpreter lock of another thread, which in turn waits for a
+    processor.
     """
     is_ready, run_ns = False, 0
     try:
         for thread in os.listdir(f"/proc/{pid}/task"):  # noqa: PTH208  pathlib takes a megabyte
             is_ready |= _stat(f"{pid}/task/{thread}")[0] == "R"
             run_ns += int(_read(f"/proc/{pid}/task/{thread}/schedstat").split()[0])
-    except (OSError, IndexError):  # gone, or a kernel without the statistics
+    except (OSError, IndexError):  # the process is gone, or the kernel has no such statistics
         return None
     return run_ns // 1000 if is_ready else None
 
 
 def hurry(pid: int) -> None:
-    """Give all threads of `pid` the priority of the control loop, where that is permitted.
+    """Give all threads of `pid` the priority of the control loop, if that is permitted.
 
-    A killed process ends with its last thread, and only then another process may open its devices. Its other threads
-    have no real-time priority: beside busy processes they wait for a processor, and with them the wheels.
+    Another process may open the devices of a killed process only after the end of its last thread. Threads without
+    real-time priority may wait for a busy processor while the wheels turn.
     """
     with suppress(OSError):
         for thread in os.listdir(f"/proc/{pid}/task"):  # noqa: PTH208  pathlib takes a megabyte
@@ -349,7 +349,7 @@ def hurry(pid: int) -> None:
 
 
 def _children() -> list[int]:
-    """Return the process ids of our children; not every kernel lists them in one file."""
+    """Return the process ids of the children. Not every kernel lists them in one file."""
     own, found = str(os.getpid()), []
     for name in os.listdir("/proc"):  # noqa: PTH208  pathlib takes a megabyte
         with suppress(OSError):
@@ -359,7 +359,7 @@ def _children() -> list[int]:
 
 
 def _stat(pid: int | str) -> list[str]:
-    """Return the fields of a process from its state on."""
+    """Return the fields of a process, from its state on."""
     return _read(f"/proc/{pid}/stat").rpartition(")")[2].split()
 
 
@@ -371,12 +371,12 @@ def _read(path: str) -> str:
 def main(setup: dict[str, Any]) -> None:
     """Run the guardian of `setup` and end with the exit code of its robot."""
     start_log(None, "robot")
-    ctypes.CDLL(None).prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)  # what a driver process leaves becomes ours to kill
+    ctypes.CDLL(None).prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)  # children of a dead driver process come to this one
     try:
         guardian = Guardian(setup)
     except Exception as error:
         _log.error("robot %s: the guardian does not start: %s: %s", setup["robot"], type(error).__name__, error)
         sys.exit(1)
     for _ in request_real_time(GUARDIAN_PRIORITY):
-        pass  # the driver process logs what is not permitted
+        pass  # the driver process logs the missing permissions
     sys.exit(guardian.run())

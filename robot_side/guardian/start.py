@@ -1,7 +1,7 @@
-"""Become the guardian of a fork of this process; the fork's end of their sockets. Shell.
+"""Become the guardian of a fork of this process, and the fork's end of their sockets. Shell.
 
-The process that the user or systemd started becomes the guardian, so that it is the parent of each driver process. Its
-fork goes on as the first driver process without a second start of the interpreter.
+The process that the user or systemd started becomes the guardian, so that it is the parent of each driver process. The
+fork continues as the first driver process, without a second start of the interpreter.
 """
 
 import json
@@ -35,11 +35,11 @@ _GUARDIAN: Final = (
     "top = type(sys)('sightline'); top.__path__ = [setup['root']]; sys.modules['sightline'] = top; "
     "from sightline.robot_side.guardian.process import main; main(setup)"
 )
-"""It looks for modules where this process does, without Python's site module, which takes 2 MB."""
+"""It uses the module search path of this process, without Python's site module, which takes 2 MB."""
 
 
 class GuardianEnd:
-    """The guardian as the process with the motors sees it."""
+    """The driver process's end of the sockets to its guardian."""
 
     def __init__(
         self, heartbeats: socket.socket, stops: socket.socket | None = None, *, is_restart: bool = False
@@ -47,17 +47,17 @@ class GuardianEnd:
         for end in filter(None, (heartbeats, stops)):
             end.setblocking(False)
         self.heartbeats = heartbeats
-        """To wait on: readable when the guardian is gone."""
+        """Readable when the guardian is gone."""
         self.stops = stops
-        """To wait on: STOPs of the STOP receiver, also those of before this process; None without a receiver."""
+        """STOPs of the STOP receiver, also earlier ones than this process; None without a receiver."""
         self.is_restart = is_restart
         """True if the guardian started this process after another one."""
 
     def wait(self) -> None:
-        """Wait until the guardian watches this process. Nothing may move before.
+        """Wait until the guardian watches this process. Before that, nothing may move.
 
         Raises:
-            HardwareError: it ended, or is not ready in time.
+            HardwareError: the guardian ended, or is not ready in time.
         """
         if not select.select([self.heartbeats], [], [], STARTS_WITHIN_US / 1e6)[0] or self.is_gone():
             raise HardwareError("the guardian of this process does not start; see its line above")
@@ -66,7 +66,7 @@ class GuardianEnd:
         """Send a heartbeat; never waits."""
         with suppress(OSError):
             self.heartbeats.send(pack_beat(kind, heartbeat_us()))
-            if kind in (LOST, FAILED):  # it is the last one; its end wakes the guardian, and a heartbeat does not
+            if kind in (LOST, FAILED):  # the last heartbeat: the end of the socket wakes the guardian immediately
                 self.heartbeats.shutdown(socket.SHUT_WR)
 
     def is_gone(self) -> bool:
@@ -84,7 +84,7 @@ def become_guardian(config: RobotConfig, *, restarts: bool) -> GuardianEnd:
 
     Args:
         config: the robot; its drive must have `zero(config)`.
-        restarts: whether the guardian starts a driver process after this one. Tools that an operator runs end instead.
+        restarts: True if the guardian starts a new driver process after this one. Interactive tools end instead.
 
     Raises:
         ConfigError: the drive cannot be loaded or has no `zero`.
@@ -125,22 +125,22 @@ def become_guardian(config: RobotConfig, *, restarts: bool) -> GuardianEnd:
 
 def _execute(setup: dict[str, Any], ends: list[int]) -> NoReturn:
     try:
-        schedule_real_time(GUARDIAN_PRIORITY)  # now, since the fork gets real-time scheduling while the guardian starts
-        file = os.memfd_create("guardian", 0)  # its setup; no part of it is in the list of processes
+        schedule_real_time(GUARDIAN_PRIORITY)  # now, because the fork gets real-time scheduling during this start
+        file = os.memfd_create("guardian", 0)  # the setup stays out of the process list
         os.write(file, json.dumps(setup).encode())
         os.lseek(file, 0, os.SEEK_SET)
         for number in ends:
             os.set_inheritable(number, True)
         os.execv(sys.executable, [sys.executable, "-I", "-S", "-c", _GUARDIAN, str(file)])
     finally:
-        os._exit(1)  # the fork observes that its guardian is gone
+        os._exit(1)  # the fork detects that its guardian is gone
 
 
 def stop_receiver_of(config: RobotConfig) -> StopProcess | None:
-    """Prepare the STOP receiver beside the links of this robot; None where keys are used without a STOP secret.
+    """Prepare the STOP receiver for the links of this robot; None with keys but without a STOP secret.
 
     Raises:
-        ConfigError: the robot listens where it could not open its STOP port.
+        ConfigError: the robot listens at an endpoint without a possible STOP port.
     """
     addresses, routers = own_stop_addresses(config.listen), stop_addresses(config.connect)
     try:
@@ -154,7 +154,7 @@ def stop_receiver_of(config: RobotConfig) -> StopProcess | None:
 
 
 def zero_of(config: RobotConfig) -> tuple[Callable[[Mapping[str, Any]], None], dict[str, Any]]:
-    """Return the drive's `zero` and its argument. Raises ConfigError without one that another process can import."""
+    """Return the drive's `zero` and its argument. Raises ConfigError unless another process can import it."""
     plugin, options = DRIVES.load(config.motors)
     zero = getattr(plugin, "zero", None)
     if not callable(zero) or getattr(zero, "__module__", None) is None or "<" in getattr(zero, "__qualname__", "<"):

@@ -1,11 +1,11 @@
-"""Logic of the STOP port: of the receiver beside a driver process, and of the forwarder beside a router. Pure.
+"""Logic of the STOP port: the receiver next to a driver process, and the forwarder next to a router. Pure.
 
 Packets between receiver and driver process, over one `SOCK_SEQPACKET` pair that outlives both:
 
     receiver -> driver   `S` number                              a valid STOP came
-                         `C` reason count ... address            datagrams that were ignored since the last such packet
+                         `C` reason count ... address            ignored datagrams since the last such packet
                          `L` text                                a line for the log
-    driver -> receiver   `R` number state at_rest stored         newest applied STOP, and the state now
+    driver -> receiver   `R` number state at_rest stored         newest applied STOP, and the current state
 """
 
 import struct
@@ -29,10 +29,10 @@ _NUMBER: Final = struct.Struct(">cQ")
 _REPORT: Final = struct.Struct(">cQB??")
 _REPORT_US: Final = 1_000_000
 _SILENT_US: Final = 500_000
-"""A driver process reports ten times a second. After this time its state is unknown."""
+"""Age of the last report after which the state of the driver process is unknown. It reports ten times a second."""
 _LOST_US: Final = 50_000
-"""A live driver process applies a STOP within a tick. One that reports without it never read it: its predecessor did,
-and died with it."""
+"""A live driver process applies a STOP within a tick. A later report without the STOP shows that the process has not
+read it: an earlier process did, and died."""
 
 
 class DriverReport(NamedTuple):
@@ -60,7 +60,7 @@ def unpack_number(packet: bytes) -> int:
 
 
 class IgnoredDatagrams:
-    """Counts the datagrams that were ignored, by reason, and reports them once a second."""
+    """Counts ignored datagrams by reason, and reports them once a second."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
@@ -73,7 +73,7 @@ class IgnoredDatagrams:
         self._address = address
 
     def report(self, send: Callable[[bytes], bool], now_us: int) -> None:
-        """Send the counts, with the address of the last datagram; without room for them, again after a second."""
+        """Send the counts, with the address of the last datagram. If it cannot be sent, try again after a second."""
         if not self._counts or now_us < self._report_us:
             return
         self._report_us = now_us + _REPORT_US
@@ -89,7 +89,7 @@ def unpack_ignored(packet: bytes) -> tuple[dict[str, int], str]:
 
 
 class ReceiverCore:
-    """STOP port of one robot."""
+    """Logic of the STOP port of one robot."""
 
     def __init__(self, robot: str, secret: bytes, challenge: bytes, number: int) -> None:
         """Begin without a report of the driver process.
@@ -98,7 +98,7 @@ class ReceiverCore:
             robot: robot id.
             secret: STOP secret, or b"" to accept every STOP.
             challenge: random bytes of this start.
-            number: of the STOPs so far; above that of any earlier receiver, e.g. the time since boot, us.
+            number: first STOP number, above that of any earlier receiver, e.g. the time since boot, us.
         """
         self._robot, self._secret, self._challenge = robot, secret, challenge
         self._received = self._sent = self._applied = number
@@ -107,17 +107,17 @@ class ReceiverCore:
         self._has_lost = False
 
     def on_stop(self, data: bytes, one: StopDatagram, now_us: int) -> bytes:
-        """Take a STOP. Returns the answer.
+        """Process a STOP. Returns the answer.
 
         Args:
             data: the datagram.
-            one: the same, decoded.
+            one: the decoded datagram.
             now_us: time of the receiver.
 
         Raises:
-            WireError: ignore it.
+            WireError: the caller must ignore the datagram.
         """
-        # Answers have the challenge and an HMAC: one that comes back must not count as a STOP.
+        # Answers have the challenge and an HMAC, so a reflected answer must not count as a STOP.
         if one.kind is not Kind.STOP:
             raise WireError(RejectReason.MALFORMED, "expected a STOP")
         if one.robot != self._robot:
@@ -141,14 +141,14 @@ class ReceiverCore:
         return pack_stop(answer, self._secret)
 
     def on_report(self, packet: bytes, now_us: int) -> None:
-        """Take a report of the driver process."""
+        """Process a report of the driver process."""
         _, applied, state, at_rest, stored = _REPORT.unpack(packet)
         self._report, self._report_us = DriverReport(applied, STATES[state], at_rest, stored), now_us
         self._applied = max(self._applied, applied)
         self._has_lost = self._sent > self._applied and now_us - self._sent_us >= _LOST_US
 
     def packet(self, now_us: int) -> bytes | None:
-        """Return the STOP to send to the driver process now, or None. One is in flight at a time."""
+        """Return the next STOP packet for the driver process, or None. One packet at a time is in flight."""
         is_free = self._sent <= self._applied or self._has_lost
         if self._received <= self._applied or not is_free:
             return None
@@ -159,8 +159,8 @@ class ReceiverCore:
 class Registration:
     """Registers a robot at one router, so that the router forwards STOPs to it.
 
-    With a secret it answers each challenge at the address that the challenge came from: a router has one per address
-    of the robot, and a robot may reach it from two families, or with another port of a NAT.
+    With a secret it answers each challenge at the source address of the challenge. A router has one challenge for each
+    address of the robot, which may have two address families, or another port of a NAT.
     """
 
     def __init__(self, robot: str, secret: bytes, counter: int) -> None:
@@ -177,11 +177,11 @@ class Registration:
         return pack_stop(StopDatagram(Kind.REGISTER, self._robot, counter, challenge), self._secret)
 
     def awaits(self, one: StopDatagram) -> bool:
-        """Return True for an answer to this registration."""
+        """Return True if the datagram answers this registration."""
         return one.kind is Kind.ANSWER and self._first < one.counter <= self._counter + bool(self._secret)
 
     def on_answer(self, data: bytes, one: StopDatagram) -> bytes | None:
-        """Take an answer that it awaits. Returns the datagram to send back immediately, or None.
+        """Process an expected answer. Returns the datagram to send back immediately, or None.
 
         Raises:
             WireError: it has no valid HMAC.
@@ -189,32 +189,32 @@ class Registration:
         if not self._secret:
             return None
         check_hmac(data, self._secret)
-        # An odd number is that of a datagram with a challenge. Its answer needs none, or the two would never end.
+        # An odd number belongs to a datagram with a challenge. Its answer needs no reply, otherwise replies never end.
         return None if (one.counter - self._first) % 2 else self._pack(one.counter + 1, one.challenge)
 
 
-# The forwarder beside a router.
+# The forwarder next to a router.
 
 
 MAX_ROBOTS: Final = 1024
 """Security limit: robots of one router."""
 MAX_PLACES: Final = 8
-"""Security limit: addresses of one robot id. Without keys a third party may register the id too: STOP goes to all."""
+"""Security limit: addresses of one robot id. Without keys a third party may use the same id, so STOP goes to all."""
 MAX_OPERATORS: Final = 64
-"""Security limit: addresses of operators with STOPs whose answer may still come."""
+"""Security limit: operator addresses with STOPs that wait for an answer."""
 MAX_WAITING: Final = 64
-"""Security limit: such STOPs of one address, so that a flood from another one displaces none. 0.6 s of STOPs."""
+"""Security limit: waiting STOPs of one address, so that a flood from another address removes none. 0.6 s of STOPs."""
 _NO_HMAC: Final = bytes(32)
 _FRESH_US: Final = 3_000_000
 Origin = tuple[int, tuple[str, int]]
-"""Socket on which a datagram came, and the address of its sender."""
+"""Socket of a datagram, and the address of its sender."""
 
 
 class ForwarderCore:
-    """Forwards STOPs to the robots that registered, and the answers back."""
+    """Forwards STOPs to the registered robots, and returns the answers."""
 
     def __init__(self, secret: bytes, seed: bytes) -> None:
-        """Begin without robots. With a secret, only robots that know it may register.
+        """Begin without robots. With a secret, only robots with this secret may register.
 
         Args:
             secret: STOP secret, or b"".
@@ -227,10 +227,10 @@ class ForwarderCore:
         """Host -> robot and counter of a STOP -> its sender."""
 
     def on_datagram(self, data: bytes, origin: Origin, now_us: int) -> list[tuple[bytes, Origin]]:
-        """Take a datagram. Returns what to send.
+        """Process a datagram. Returns the datagrams to send.
 
         Raises:
-            WireError: ignore it.
+            WireError: the caller must ignore the datagram.
         """
         one = unpack_stop(data)
         if one.kind is Kind.REGISTER:
@@ -244,7 +244,7 @@ class ForwarderCore:
         if not places:
             raise WireError(RejectReason.OTHER_ROBOT, "for a robot that is not registered here")
         if self._secret and data.endswith(_NO_HMAC):
-            # Without an HMAC of its own: with one, a third party could hand it to an operator with the secret.
+            # Without an HMAC, because a third party could pass one to an operator with the secret.
             return [(pack_stop(StopDatagram(Kind.ANSWER, one.robot, one.counter, keyed=True)), origin)]
         if self._secret:
             check_hmac(data, self._secret)
@@ -264,7 +264,7 @@ class ForwarderCore:
     def _register(
         self, data: bytes, one: StopDatagram, origin: Origin, now_us: int
     ) -> list[tuple[bytes, Origin]]:
-        # Of the address: otherwise a recorded registration would send STOPs to any address.
+        # It depends on the address. Otherwise a recorded registration could direct STOPs to any address.
         challenge = challenge_of(self._seed, *origin[1][:2])
         if self._secret and one.challenge != NO_CHALLENGE:
             if one.challenge != challenge:
@@ -276,7 +276,7 @@ class ForwarderCore:
         return [(pack_stop(answer, self._secret), origin)]
 
     def _place(self, robot: str, origin: Origin, now_us: int) -> None:
-        """Note where a robot is. A robot that still registers is never forgotten for another sender."""
+        """Store the address of a robot. A robot that still registers is never forgotten for another sender."""
         if robot not in self._robots and len(self._robots) >= MAX_ROBOTS:
             quiet = next((name for name, places in self._robots.items() if not _is_fresh(places, now_us)), None)
             if quiet is None:

@@ -22,7 +22,7 @@ from sightline.robot_side.guardian.stop_core import ForwarderCore, IgnoredDatagr
 
 
 def start(addresses: Sequence[Address], secret_file: str) -> StopProcess:
-    """Prepare the forwarder of one router; `keep_alive` of what is returned starts it.
+    """Prepare the forwarder of one router. `keep_alive` of the result starts it.
 
     Args:
         addresses: UDP addresses to listen on.

@@ -1,6 +1,6 @@
-"""The STOP receiver: a process that reads the STOP port of a robot and does nothing else. Shell.
+"""The STOP receiver: a process that only reads the STOP port of a robot. Shell.
 
-Load on the links cannot hold it up. It imports the standard library only. `start` is for the process that starts it.
+Load on the links cannot delay it. It imports the standard library only. Another process calls `start`.
 """
 
 import os
@@ -26,7 +26,7 @@ _REGISTER_S: Final = 1.0
 
 
 def start(robot: str, addresses: Sequence[Address], routers: Sequence[Address], secret_file: str) -> StopProcess:
-    """Prepare the receiver of one robot; `keep_alive` of what is returned starts it.
+    """Prepare the receiver of one robot. `keep_alive` of the result starts it.
 
     Args:
         robot: robot id.
@@ -47,11 +47,11 @@ class StopReceiver:
         self._routers = [(address, Registration(robot, secret, _random())) for address in routers]
         self._ignored = IgnoredDatagrams()
         self._unreachable: set[Address] = set()
-        """Routers that were logged because no datagram could be sent to them."""
+        """Routers to which a datagram could not be sent, as logged."""
         if routers:
-            import threading  # for a robot that connects to a router only
+            import threading  # only for a robot that connects to a router
 
-            # A thread, because a name server may take seconds.
+            # A separate thread, because a name server may take seconds.
             threading.Thread(target=self._register_all, name="registration", daemon=True).start()
 
     def _register_all(self) -> None:
@@ -80,11 +80,11 @@ class StopReceiver:
             return ()
 
     def on_report(self, packet: bytes) -> None:
-        """Take a report of the driver process."""
+        """Process a report of the driver process."""
         self._core.on_report(packet, now_us())
 
     def on_turn(self) -> None:
-        """Send the driver process what is new."""
+        """Send a new STOP to the driver process."""
         packet = self._core.packet(now_us())
         if packet is not None:
             self._port.send(packet)

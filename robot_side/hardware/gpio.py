@@ -31,12 +31,12 @@ RimSpeed = Annotated[float, Field(gt=0, le=3)]
 Rows = Annotated[tuple[tuple[Duty, RimSpeed], ...], Field(min_length=1, max_length=32)]
 
 GUESSED_ROWS = ((0.40, 0.08), (0.60, 0.12), (1.00, 0.19))
-"""Guess for a car that was not measured: 60 rpm at 6 V (the motors of the legacy article), about 2 V lost in an L298N
-on 7.4 V, 65 mm wheels, and no motion below the 40 % at which the legacy program turned."""
+"""Guess for an uncalibrated car: 60 rpm at 6 V (the motors of the legacy article), about 2 V lost in an L298N at 7.4 V,
+65 mm wheels, and no motion below the 40 % at which the legacy program turned."""
 
 
 class TableConfig(Config):
-    """Rows of (duty, meters per second at the rim), both rising. The first row is the least duty that turns a wheel."""
+    """Rows of (duty, m/s at the rim), both rising. The first row is the least duty that turns a wheel."""
 
     table: Rows = GUESSED_ROWS
 
@@ -50,15 +50,15 @@ class TableConfig(Config):
 
 
 class DutyTable:
-    """Straight lines between the rows. Whatever is faster than the last row gets the last row's duty."""
+    """Interpolates linearly between the rows. A faster speed than the last row gets the duty of the last row."""
 
     def __init__(self, rows: Sequence[tuple[float, float]]) -> None:
         self._rows = tuple(rows)
 
     def duty(self, speed_mps: float) -> float:
-        """Return the duty (-1..1) for a speed, rad/s.
+        """Return the duty (-1..1) for a speed, m/s.
 
-        Stiction: it is 0 below half the least speed, and the least duty from there to the least speed.
+        Because of static friction it is 0 below half the least speed, and the least duty from there to the least speed.
         """
         least_duty, least_mps = self._rows[0]
         wanted_mps = abs(speed_mps)
@@ -67,7 +67,7 @@ class DutyTable:
         return _signed(_between([(mps, duty) for duty, mps in self._rows], wanted_mps, least_duty), speed_mps)
 
     def speed(self, duty: float) -> float:
-        """Return the speed of a duty by the table, rad/s; 0 below the least duty."""
+        """Return the speed of a duty by the table, m/s; 0 below the least duty."""
         given = abs(duty)
         return 0.0 if given < self._rows[0][0] else _signed(_between(self._rows, given, self._rows[0][1]), duty)
 
@@ -77,7 +77,7 @@ def _between(rows: Sequence[tuple[float, float]], at: float, below: float) -> fl
         return below
     for (x, y), (next_x, next_y) in itertools.pairwise(rows):
         if at <= next_x:
-            return min(y + (next_y - y) * (at - x) / (next_x - x), next_y)  # a sum may round to more than 1
+            return min(y + (next_y - y) * (at - x) / (next_x - x), next_y)  # rounding may exceed 1
     return rows[-1][1]
 
 
@@ -92,7 +92,7 @@ def table_of(text: str, where: str) -> tuple[tuple[float, float], ...]:
     except ValidationError as error:
         problem = first_problem(error, known=TableConfig.model_fields)
         raise ConfigError(f"{where}: {problem}; rows are [duty, m/s], e.g. [0.4, 0.08]") from None
-    except (ValueError, RecursionError) as error:  # also a number of too many digits
+    except (ValueError, RecursionError) as error:  # also for a number with too many digits
         raise ConfigError(f"{where}: invalid TOML: {error}") from None
 
 
@@ -102,9 +102,9 @@ def table_text(rows: Sequence[tuple[float, float]], head: str) -> str:
     return f"# {head}\ntable = [ # duty, meters per second at the rim\n{lines}]\n"
 
 
-# A Raspberry Pi's output pins through gpiozero and lgpio: PWM, enable lines, and how they are left behind. Shell.
+# Output pins of a Raspberry Pi through gpiozero and lgpio: PWM, enable lines, and their state at the end. Shell.
 #
-# Both libraries are imported when the pins are opened; the robot's base install has neither.
+# Both libraries are imported when the pins are opened, because the base install has neither.
 
 
 _SPI_DEVICE: Final = Path("/dev/spidev0.0")
@@ -113,14 +113,14 @@ _FROM_APT: Final = "or sudo apt install python3-gpiozero python3-lgpio"
 
 
 class Pins(Protocol):
-    """Output pins by BCM number. All methods may raise whatever the library raises."""
+    """Output pins by BCM number. All methods may raise any error of the library."""
 
     def write(self, number: int, duty: float) -> None:
-        """Drive a pin high for that share (0..1) of each PWM period."""
+        """Drive a pin high for the share `duty` (0..1) of each PWM period."""
         ...
 
     def enable(self, wanted: bool) -> None:
-        """Set the enable lines high or low, if there are any."""
+        """Set the enable lines, if there are any, high or low."""
         ...
 
     def pulse(self) -> None:
@@ -148,7 +148,7 @@ class WiredPins(Protocol):
 def open_pins(config: WiredPins) -> Pins:
     """Open the pins, all low.
 
-    Raises ConfigError without gpiozero or lgpio, HardwareError where the pins cannot be had.
+    Raises ConfigError without gpiozero or lgpio, HardwareError if the pins are not available.
     """
     _warn_of_spi(config.pins)
     try:
@@ -165,7 +165,7 @@ def open_pins(config: WiredPins) -> Pins:
 
 
 class GpiozeroPins:
-    """`made`: whether the pin factory is ours to close."""
+    """`made`: True if this object created the pin factory and must close it."""
 
     def __init__(self, gpiozero: Any, config: WiredPins, made: bool) -> None:
         self._device_class, self._made = gpiozero.Device, made
@@ -175,7 +175,7 @@ class GpiozeroPins:
         self._pulses: list[Any] = []
         self._motors: dict[int, Any] = {}
         try:
-            # gpiozero's Motor takes no frequency, so each pin is a device of its own.
+            # gpiozero's Motor has no frequency option, so each pin is a separate device.
             for number in config.enable_pins:
                 self._enables.append(gpiozero.DigitalOutputDevice(number))
             for number in pulse_pins:
@@ -187,7 +187,7 @@ class GpiozeroPins:
             raise
 
     def write(self, number: int, duty: float) -> None:
-        """Drive a pin high for that share of each PWM period."""
+        """Drive a pin high for the share `duty` of each PWM period."""
         self._motors[number].value = duty
 
     def enable(self, wanted: bool) -> None:
@@ -204,7 +204,7 @@ class GpiozeroPins:
         """Set the enable lines low first, then the pins of the motors, and release them. Idempotent."""
         devices = (*self._enables, *self._motors.values(), *self._pulses)
         for device in devices:
-            with suppress(Exception):  # the rest still has to go down
+            with suppress(Exception):  # the other pins must be set low, too
                 device.value = 0
         for device in devices:
             with suppress(Exception):
@@ -215,7 +215,7 @@ class GpiozeroPins:
             self._give_back()
 
     def _give_back(self) -> None:
-        """gpiozero leaves pins as inputs without a pull, and an L298N takes a floating input for high."""
+        """Close the pin factory. gpiozero leaves pins as floating inputs, which an L298N reads as high."""
         factory, self._device_class.pin_factory = self._device_class.pin_factory, None
         chip = getattr(factory, "chip", None)
         with suppress(Exception):
@@ -226,7 +226,7 @@ class GpiozeroPins:
 
 
 def _ensure_factory(gpiozero: Any) -> bool:
-    """lgpio, unless GPIOZERO_PIN_FACTORY or the program chose another; gpiozero's own fall-backs have no PWM."""
+    """Create an lgpio factory, unless another one is configured. gpiozero's own fallbacks have no PWM."""
     device = gpiozero.Device
     if device.pin_factory is not None:
         return False
@@ -263,15 +263,15 @@ def _line(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-# Two motors on an H-bridge (L298N) at a Raspberry Pi's pins: duty by a calibration table, no encoders. Shell.
+# Two motors on an H-bridge (L298N) at the pins of a Raspberry Pi: duty by a calibration table, no encoders. Shell.
 #
-# One pin of a motor is low before the other is driven; every end and every failure leaves all of them low.
+# One pin of a motor is set low before the other one is driven. Every end and every failure sets all pins low.
 
 
 BcmPin = Annotated[int, Field(ge=2, le=27)]
-"""Broadcom's number, not the position on the header. 0 and 1 belong to the memory of add-on boards."""
+"""BCM number, not the position on the header. 0 and 1 belong to the memory of add-on boards."""
 _REVERSAL_PERIODS = 2
-"""Of the PWM: a new duty begins with the next period, so both pins are low for two before the other one is driven."""
+"""Pause in PWM periods. A new duty begins with the next period, so both pins are low before the other one is driven."""
 
 
 class GpioDriveConfig(TableConfig):
@@ -284,24 +284,24 @@ class GpioDriveConfig(TableConfig):
     enable_pins: Annotated[tuple[BcmPin, ...], Field(max_length=2)] = ()
     """ENA and ENB of the bridge, on one pin or two: high from the first motion until a failure or the end."""
     pulse_pin: BcmPin | None = None
-    """Changes its level with each command of the control loop, for a cutoff: docs/how-to/hardware-cutoff.md."""
+    """Pin that toggles with each command of the control loop, for a cutoff: docs/how-to/hardware-cutoff.md."""
     pwm_hz: Annotated[int, Field(ge=400, le=10_000)] = 2_000
     left_reversed: bool = False
     right_reversed: bool = False
     swapped: bool = False
-    """The motor on the left pins is the right one."""
+    """True if the motor on the left pins is the right one."""
     trim: Annotated[float, Field(ge=-0.3, le=0.3)] = 0.0
-    """Share by which the left wheel is slowed (negative: the right one), for a car that bends to the right (left)."""
+    """Share by which the left wheel is slowed (negative: the right one), for a car that drifts to the right (left)."""
     table_file: Path | None = None
-    """As `sightline calibrate drive` writes it, in place of `table`."""
+    """File of `sightline calibrate drive`, in place of `table`."""
     odometry: Literal["table", "none"] = "table"
-    """Without encoders: how far the wheels should have turned by the table, or nothing at all."""
+    """Without encoders: `table` predicts the wheel angles from the table, `none` gives none."""
     wheel_radius_m: Annotated[float, Field(gt=0.005, lt=1.0)]
-    """Comes from the robot's own `wheels.wheel_radius_m`."""
+    """Set from `wheels.wheel_radius_m` of the robot."""
 
     @property
     def pins(self) -> tuple[int, int, int, int]:
-        """Those of the motors: left forward and backward, right forward and backward."""
+        """Pins of the motors: left forward and backward, right forward and backward."""
         return self.left_forward_pin, self.left_backward_pin, self.right_forward_pin, self.right_backward_pin
 
     @model_validator(mode="after")
@@ -316,7 +316,7 @@ class GpioDriveConfig(TableConfig):
 
 
 class GpioDrive:
-    """`opening` and `pause` are seams for tests; the pins are low when it is constructed and when it is closed."""
+    """`opening` and `pause` are replaced in tests. The pins are low after construction and after `close`."""
 
     Config = GpioDriveConfig
     zero = staticmethod(zero)
@@ -338,7 +338,7 @@ class GpioDrive:
         self._angles = WheelAngles(0.0, 0.0, monotonic_us())
 
     def set(self, left_rad_s: float, right_rad_s: float) -> None:
-        """Give wheel speeds; takes two PWM periods where a wheel reverses, else no time."""
+        """Set the wheel speeds. If a wheel reverses, it waits two PWM periods."""
         if not (math.isfinite(left_rad_s) and math.isfinite(right_rad_s)):
             self._all_low()
             raise HardwareError(f"invalid wheel speeds ({left_rad_s}, {right_rad_s}): not finite; pins set low")
@@ -347,10 +347,10 @@ class GpioDrive:
         self.set_duty(*duties)
 
     def set_duty(self, left: float, right: float) -> None:
-        """Give duties, -1..1, forward positive. Raises HardwareError, with the pins low, when a pin fails."""
+        """Set the duties, -1..1, forward positive. If a pin fails, it sets all pins low and raises HardwareError."""
         self._angles = self._expected()
         pins, moves = self._opened(), bool(left or right)
-        if self._failed and moves:  # a gate that ramps down must not bring the wheels up again
+        if self._failed and moves:  # the gate's ramp to zero must not start the wheels again
             raise HardwareError("GPIO has failed; its pins stay low until the next zero speed")
         try:
             wanted = list(zip(self._motors, (left, right), strict=True))
@@ -385,7 +385,7 @@ class GpioDrive:
         return 1 - max(0.0, trim), 1 - max(0.0, -trim)
 
     def _speeds(self, left: float, right: float) -> tuple[float, float]:
-        """Return the speeds at the rims. The trim slows the quicker wheel, so that both turn equally."""
+        """Return the speeds at the rims. The trim slows the faster wheel, so that both turn equally."""
         shares = self._shares
         return self.table.speed(left) / shares[0], self.table.speed(right) / shares[1]
 
@@ -422,13 +422,13 @@ class _Motor:
         self._duty = dict.fromkeys(pins, 0.0)
 
     def let_go(self, pins: Pins, duty: float) -> bool:
-        """Put low what `duty` does not drive; whether a pin that was driven has to make way for the other one."""
+        """Set the pins low that `duty` does not drive. Returns True if the other pin must wait for a reversal."""
         idle = [self._pins[duty > 0]] if duty else [*self._pins]
         was_driven = [self._write(pins, number, 0.0) for number in idle]
         return any(was_driven) and duty != 0
 
     def drive(self, pins: Pins, duty: float) -> None:
-        """Drive the pin of that direction; the other is low."""
+        """Drive the pin for the direction of `duty`. The other pin is low."""
         if duty:
             self._write(pins, self._pins[duty < 0], min(1.0, abs(duty)))
 
@@ -438,7 +438,7 @@ class _Motor:
             try:
                 if pins is not None:
                     pins.write(number, 0.0)
-            except Exception:  # the others still have to go down
+            except Exception:  # the other pin must be set low, too
                 continue
             self._duty[number] = 0.0
 

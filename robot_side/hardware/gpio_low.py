@@ -1,9 +1,9 @@
-"""Pins driven low and left so, by lgpio alone: for the end of a drive, and for after a driver that was killed. Shell.
+"""Set pins low permanently with lgpio alone: at the end of a drive, and after a driver was killed. Shell.
 
     python -m sightline.robot_side.hardware.gpio_low 10 9 8 7
 
-Needs neither gpiozero nor a configuration. The internal pull-down (about 50 kilohms) stays when the program has gone,
-where the kernel turns a pin without an owner into an input.
+It needs neither gpiozero nor a configuration. The internal pull-down (about 50 kilohms) remains after the program, when
+the kernel turns a pin without an owner into an input.
 """
 
 import importlib
@@ -14,16 +14,16 @@ from contextlib import suppress
 from typing import Any, Final
 
 _CHIPS: Final = (0, 4)
-"""A Raspberry Pi 5 with an early kernel has its header on the chip 4, every other on 0."""
+"""Chip of the header: 4 on a Raspberry Pi 5 with an early kernel, otherwise 0."""
 _HEADER_LABEL: Final = "pinctrl-"
 
 
 def import_lgpio() -> Any:
-    """lgpio makes a pipe in the folder it is imported in, and fails where it may not: it gets a folder of its own."""
+    """Import lgpio in a temporary folder, because it creates a pipe in the current folder and may fail there."""
     if "lgpio" in sys.modules or "LG_WD" in os.environ:
         return importlib.import_module("lgpio")
-    # With `os` alone: `tempfile` and `pathlib` would cost the guardian 1.8 MB.
-    here = os.getcwd()  # noqa: PTH109  lgpio leaves it, and what is relative must stay so
+    # Only `os`, because `tempfile` and `pathlib` would cost the guardian 1.8 MB.
+    here = os.getcwd()  # noqa: PTH109  lgpio changes the current folder, so relative paths must be restored
     memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else os.environ.get("TMPDIR", "/tmp")  # the disk may be full
     folder = f"{memory}/sightline-{os.urandom(8).hex()}"
     os.mkdir(folder, 0o700)  # noqa: PTH102
@@ -39,8 +39,8 @@ def import_lgpio() -> Any:
 
 
 def prepare() -> None:
-    """Import lgpio before `zero` needs it: the card may fail when the driver does."""
-    with suppress(Exception):  # without it the drive does not open either, and gives the reason
+    """Import lgpio before `zero` needs it, because the card may fail together with the driver."""
+    with suppress(Exception):  # without lgpio the drive does not open either, and reports the reason
         import_lgpio()
 
 
@@ -51,7 +51,7 @@ def zero(config: Mapping[str, Any]) -> None:
 
 
 def leave_low(numbers: Sequence[int], chip: int | None = None) -> None:
-    """Make outputs of the pins, low and with a pull-down. Raises whatever lgpio raises; every pin is tried first."""
+    """Make the pins outputs, low and with a pull-down. It tries every pin, then raises any error of lgpio."""
     lgpio = import_lgpio()
     handle = lgpio.gpiochip_open(chip) if chip is not None else _header(lgpio)
     troubles: list[Exception] = []
@@ -68,11 +68,11 @@ def leave_low(numbers: Sequence[int], chip: int | None = None) -> None:
 
 
 def _header(lgpio: Any) -> Any:
-    """Open the chip of the pins of the header."""
+    """Open the chip of the header pins."""
     for chip in _CHIPS:
         try:
             handle = lgpio.gpiochip_open(chip)
-        except Exception:  # not there
+        except Exception:  # no such chip
             continue
         if str(lgpio.gpio_get_chip_info(handle)[3]).startswith(_HEADER_LABEL):
             return handle

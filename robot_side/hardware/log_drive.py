@@ -1,4 +1,4 @@
-"""Write wheel speeds to a file in place of motors, and turn ideal wheels. Shell (a file and a clock)."""
+"""Write wheel speeds to a file instead of motors, and simulate ideal wheels. Shell (a file and a clock)."""
 
 import os
 from pathlib import Path
@@ -10,13 +10,13 @@ from sightline.robot_side.ports import WheelAngles
 
 
 class LogDriveConfig(Config):
-    """`path`: CSV of t_us,left_rad_s,right_rad_s, one line per command, appended; none is written without it."""
+    """`path`: CSV of t_us,left_rad_s,right_rad_s, one line per command, appended. Without it no file is written."""
 
     path: Path | None = None
 
 
 class LogDrive:
-    """For trying a robot without wheels. Its encoders read as if every speed were reached at once."""
+    """Drive for a robot without wheels. Its encoders reach every speed immediately."""
 
     Config = LogDriveConfig
     zero = staticmethod(zero)
@@ -27,14 +27,14 @@ class LogDrive:
         self._angles = WheelAngles(0.0, 0.0, monotonic_us())
 
     def set(self, left_rad_s: float, right_rad_s: float) -> None:
-        """Log the speeds and turn by them from now on."""
+        """Log the speeds. The wheels turn with them from now on."""
         self._angles = self.wheels()
         self._speeds = (left_rad_s, right_rad_s)
         if self._file:
             self._file.write(f"{self._angles.t_us},{left_rad_s:.4f},{right_rad_s:.4f}\n")
 
     def wheels(self) -> WheelAngles:
-        """Return the angles of ideal wheels now."""
+        """Return the current angles of the ideal wheels."""
         now_us = monotonic_us()
         seconds = (now_us - self._angles.t_us) / 1e6
         left, right = self._speeds

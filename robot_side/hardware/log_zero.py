@@ -1,6 +1,6 @@
-"""The file of a `log` drive: its one owner, and zero after that owner has died. Shell.
+"""The file of a `log` drive: its single owner, and zero after the owner has died. Shell.
 
-The guardian imports this module alone, so it needs no pydantic.
+The guardian imports only this module, so it needs no pydantic.
 """
 
 import fcntl
@@ -23,7 +23,7 @@ def zero(config: Mapping[str, Any]) -> None:
 
 
 def open_log(path: str) -> int:
-    """Open the file of a `log` drive for its only owner, as a motor pin has one. Raises HardwareError."""
+    """Open the file of a `log` drive for a single owner, as for a motor pin. Raises HardwareError."""
     try:
         file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The network process: owns camera and link, decides when a frame is sent.
+"""The network process: owns camera and link, decides when to send a frame.
 
 May import: `protocol`, `robot_side`.
 Interface: `process` is its shell, `core` its logic; the driver process starts it.

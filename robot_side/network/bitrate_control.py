@@ -1,7 +1,7 @@
-"""Choose quality and size of the images, so that each passes the link in time. Pure.
+"""Select quality and size of the images, so that each image passes the link in time. Pure.
 
-The bytes per image fall by a factor on a full link, and rise slowly on a free one. Only cameras that encode their
-images can follow (`sightline.robot_side.ports.Adjustable`). Other cameras ignore the target.
+The bytes per image decrease by a factor on a full link, and increase slowly on a free link. Only a camera that encodes
+its images can follow (`sightline.robot_side.ports.Adjustable`). Other cameras ignore the target.
 """
 
 from typing import Final, NamedTuple
@@ -12,7 +12,7 @@ from sightline.robot_side.network.congestion_window import LinkCapacity
 PICTURE_US: Final = 28_000
 # Side lengths. Half of them loses nothing, because the vision service decodes large images at half scale.
 SCALES_PERCENT: Final = (100, 50)
-# Share of the configured quality. Below it JPEG blocks hide small targets, and fewer pixels lose less.
+# Share of the configured quality. Below it JPEG blocks hide small targets, so a smaller size is better.
 LEAST_QUALITY_PERCENT: Final = 25
 
 _LEAST_BYTES: Final = 2_000
@@ -22,7 +22,7 @@ _STEP_US: Final = 250_000
 _EXCESS_US: Final = 40_000
 _FACTOR: Final = 0.8
 _OVERDUE_FACTOR: Final = 0.5
-# Length of each of the two periods with a stored lowest delay. After the second, a longer link counts as normal.
+# Length of each of the two periods with a stored lowest delay. After the second, a longer delay counts as normal.
 _FLOOR_US: Final = 5_000_000
 # Images that were already captured when the target changed.
 _LAG_FRAMES: Final = 2
@@ -63,7 +63,7 @@ class BitrateControl:
         self._made: _Cut | None = None
         self._since_us: list[int] = []
 
-    # --- what arrives ------------------------------------------------------------------------------------------
+    # --- inputs ------------------------------------------------------------------------------------------------
 
     def on_sent(self, size_bytes: int, now_us: int) -> None:
         """Note a sent image.
@@ -79,7 +79,7 @@ class BitrateControl:
         self._choose(now_us)
 
     def on_delay(self, delay_us: int, now_us: int) -> None:
-        """Note the delay of a frame that did not wait behind another.
+        """Note the delay of a frame that did not wait behind another one.
 
         Args:
             delay_us: time to the answer without the computing of the peer.
@@ -106,7 +106,7 @@ class BitrateControl:
         self._cut(self._current() * _OVERDUE_FACTOR)
         self._step_at_us = now_us + _STEP_US
 
-    # --- what follows --------------------------------------------------------------------------------------------
+    # --- decisions ---------------------------------------------------------------------------------------------
 
     def _current(self) -> float:
         budget = self._budget_bytes
@@ -121,8 +121,8 @@ class BitrateControl:
 
     def _check_cut(self, delay_us: int) -> None:
         """Undo a cut that did not shorten the delay."""
-        # If the bytes were the cause, the delay plus the saved time of the bytes is at most the delay before the cut.
-        # A larger sum shows a longer link. Fewer bytes do not help there.
+        # If the bytes were the cause, this delay plus the saved time is at most the delay before the cut. A larger sum
+        # means a longer link, where fewer bytes do not help.
         if self._made is None or not self._bytes or self._frames < _LAG_FRAMES + _CHECKED_BY:
             return
         self._since_us.append(delay_us)

@@ -1,9 +1,9 @@
 """Estimate from delays alone how many frames may be in flight. Pure.
 
-A frame sent alone shows the delay of the link. A frame sent behind another has the same delay on a long link, and waits
-on a slow link or behind a slow peer. The window therefore grows while no frame waits. The data rate while a frame waits
-is the capacity of the link. After two attempts have measured the same capacity, the next attempt comes much later: a
-camera's own JPEG of 46 kB takes 184 ms at 2 Mbit/s, and a frame behind it is twice as old.
+A frame sent alone shows the delay of the link. A frame behind another one has the same delay on a long link, but waits
+on a slow link or for a slow peer. So the window grows while no frame waits. The data rate while a frame waits is the
+capacity of the link. After two attempts with the same capacity, the next attempt comes much later: a camera's own JPEG
+of 46 kB takes 184 ms at 2 Mbit/s, and a frame behind it is twice as old.
 """
 
 from collections import deque
@@ -24,7 +24,7 @@ _LONGEST_PAUSE_US: Final = 4_000_000
 # ... unless a wider window worked for this long and this many answers. On a lossy link the width is not the cause.
 _HELD_US: Final = 1_000_000
 _HELD_ANSWERS: Final = 12
-# Time for which a measured rate bounds the width. An attempt beyond it only makes a few frames twice as old ...
+# Time for which a measured rate limits the width. An attempt beyond it only makes a few frames twice as old ...
 _THIN_US: Final = 30_000_000
 # ... if the last attempt measured the same rate within this factor. The effect of losses seldom repeats ...
 _ALIKE: Final = 1.15
@@ -32,7 +32,7 @@ _ALIKE: Final = 1.15
 _THINNER: Final = 0.8
 # Share of a frame's time at the measured rate, which is inaccurate. A frame cannot pass in less time.
 _LEAST: Final = 0.6
-# Intervals for which a large frame occupies the link. Behind a smaller one the next frame may wait briefly.
+# Intervals from which a frame counts as large. Behind a smaller one the next frame may wait briefly.
 _LARGE: Final = 2
 # Share of the time between answers. A peer that computes for longer is the bottleneck, not the link.
 _PEER_BOUND_SHARE: Final = 0.7
@@ -43,12 +43,12 @@ _KEEPS_UP: Final = 1.05
 
 @dataclass(frozen=True, slots=True)
 class AckSample:
-    """A frame's answer. `delay_us` is without the peer's computing; `held_back`: it was due before there was credit.
+    """Measurements of one answer. `delay_us` excludes the peer's computing.
 
-    `behind`: something was in flight when it left. `followed`: something left before its answer came, which waits
-    behind that on a medium that both directions share. Neither: it had the link to itself.
-    `gap_us` is from the answer before it, or from when the link began to carry it; `gap_frames` and `gap_bytes` are
-    what it carried in that time, frames that a newer one overtook among them.
+    `held_back`: the frame was due before there was credit. `behind`: another frame was in flight when it left.
+    `followed`: another frame left before its answer, which waits behind it on a medium for both directions. If neither
+    is True, the frame had the link to itself. `gap_us` is the time since the last answer, or since the link began to
+    carry the frame. `gap_frames` and `gap_bytes` were carried in that time, including frames that a newer one overtook.
     """
 
     delay_us: int
@@ -71,7 +71,7 @@ class LinkCapacity:
 
 @dataclass(frozen=True, slots=True)
 class _MeasuredRate:
-    """The rate of the link when a wider window made frames wait. A frame alone took `own_us` then."""
+    """The rate of the link while a wider window made frames wait. A frame alone took `own_us` at that time."""
 
     bytes_per_s: float
     own_us: int
@@ -83,7 +83,7 @@ class _MeasuredRate:
 
 
 class CongestionWindow:
-    """The number of `frames` that may be in flight, from 1 to `most`; one more for each `interval_us` of delay."""
+    """The number of `frames` that may be in flight, from 1 to `most`: one more for each `interval_us` of delay."""
 
     def __init__(self, interval_us: int, most: int) -> None:
         self._interval_us, self._most = interval_us, most
@@ -105,7 +105,7 @@ class CongestionWindow:
         return min(self._alone_us, default=None)
 
     def is_floor(self, delay_us: int, jitter_us: float) -> bool:
-        """Return True for the delay of a link without a queue."""
+        """Return True if this is a delay without a queue."""
         own_us = self.own_delay_us
         return own_us is not None and delay_us <= own_us + _slack_us(own_us) + jitter_us
 
@@ -137,7 +137,7 @@ class CongestionWindow:
         return None
 
     def _lower_own_delay(self, delay_us: int) -> None:
-        """Note a shorter link: a frame that was not alone, and still faster."""
+        """Note a shorter link, by a frame that was not alone and still faster."""
         own_us = self.own_delay_us
         if own_us is not None and delay_us < own_us:
             self._alone_us.append(delay_us)
@@ -149,7 +149,7 @@ class CongestionWindow:
     def _is_queue(self) -> bool:
         own_us = self.own_delay_us
         if own_us is None or not any(one.held_back for one in self._behind):
-            return False  # whatever jitters, the camera was never kept waiting
+            return False  # the camera never waited, so a variation of the delay is only jitter
         waited_us = [one.delay_us for one in self._behind]
         if len(waited_us) >= _BEHIND_KEPT - 1 and min(waited_us[1 - _BEHIND_KEPT :]) > _GROSS * own_us + _JITTER_US:
             return True
@@ -165,13 +165,13 @@ class CongestionWindow:
             held = now_us - self._changed_at_us >= _HELD_US and self._since_change >= _HELD_ANSWERS
             if held:
                 self._pause_us = _FIRST_PAUSE_US
-            elif now_us >= self._grow_at_us:  # within a pause these are frames of the attempt before it
+            elif now_us >= self._grow_at_us:  # in a pause these frames belong to the last attempt
                 self._pause_us = min(2 * self._pause_us, _LONGEST_PAUSE_US)
             self._grow_at_us = now_us + self._pause_us
             self._failed = True
             self._note_rate(full, own_us, now_us)
             self._set(max(1, kept), now_us)
-        self._behind.clear()  # what waited counts once
+        self._behind.clear()  # each waiting frame counts once
         return full
 
     def _note_rate(self, full: LinkCapacity | None, own_us: int, now_us: int) -> None:
@@ -202,8 +202,8 @@ class CongestionWindow:
 
     def _useful(self, own_us: int) -> int:
         """Return the number of frames that are captured and processed while one is in flight."""
-        # A reserve of half an interval, so that a slightly late answer costs no capture. Not for a peer that is slower
-        # than the camera: the additional frame would only wait for the peer.
+        # A reserve of half an interval, so that a slightly late answer delays no capture. Not for a peer that is slower
+        # than the camera, because the additional frame would only wait for the peer.
         if self._compute_us > self._interval_us:
             return 1 + int(own_us / self._compute_us)
         return 1 + (own_us + self._interval_us // 2) // self._interval_us

@@ -1,4 +1,4 @@
-"""Implement the logic of the network process: images in, frames out, credit, camera adaptation. Pure."""
+"""Logic of the network process: images in, frames out, credit, camera adaptation. Pure."""
 
 from collections.abc import Mapping
 
@@ -25,7 +25,7 @@ from sightline.robot_side.ports import Adjustable, Camera, Picture, scaled_model
 
 _CAMERA_PERIOD_US = 500_000
 _NOT_NEWER = "the time of the image is not after that of the one before"
-_KEPT_FRAMES = 256  # that an ack may cite, as many as the gate records
+_KEPT_FRAMES = 256  # frames that an ack may cite, as many as the gate records
 
 
 class NetworkCore:
@@ -78,8 +78,8 @@ class NetworkCore:
             now_us: monotonic clock.
 
         Returns:
-            Header and message, or None for an image that is too large, not newer than the last, or in the future. It is
-            counted.
+            Header and message. None for an image that is too large, not newer than the last one, or in the future; it
+            is counted.
         """
         self.image_fault = self._fault_of(picture, now_us)
         if self.image_fault:
@@ -96,7 +96,7 @@ class NetworkCore:
 
     def _fault_of(self, picture: Picture, now_us: int) -> str:
         """Return why an image cannot be sent, or ""."""
-        if picture.t_us > now_us:  # the frames after it would not be newer, until that time
+        if picture.t_us > now_us:  # otherwise no later frame would be newer until that time
             return f"image is {(picture.t_us - now_us) / 1e6:.3f} s in the future"
         if picture.t_us <= self._last_t_us:
             return _NOT_NEWER
@@ -143,7 +143,7 @@ class NetworkCore:
         try:
             followed = camera.adjust(*target)
         except HardwareError:
-            # `Camera.read` reports it. The next call tries again, because `_requested` is unchanged.
+            # `Camera.read` reports the error. The next call tries again, because `_requested` is unchanged.
             return
         self._requested = target
         if followed:
@@ -161,13 +161,13 @@ class NetworkCore:
             return None
         self._announced = model
         self._camera_due_us = now_us + _CAMERA_PERIOD_US
-        # It begins above the numbers of an earlier process of this session, as the time does.
+        # It starts at the current time, above the numbers of an earlier process of this session.
         self._camera_seq = now_us if self._camera_seq is None else self._camera_seq + 1
         stamp = Stamp(session=self._session, seq=self._camera_seq, t_us=now_us)
         return Message(CAMERA, "", encode(stamp), encode(model))
 
     def on_new_driver(self) -> None:
-        """Make a frame and the model of the camera due now, for a driver that arrives."""
+        """Send a frame and the camera model as soon as possible, for a new driver."""
         self._camera_due_us = 0
         self._stream.release()
 
@@ -178,12 +178,12 @@ class NetworkCore:
         """Return the counters of the stream and of the camera.
 
         Args:
-            dropped: by channel, what the slots of the link dropped.
-            missed_captures: what the slot of the camera dropped.
+            dropped: messages that the slots of the link dropped, by channel.
+            missed_captures: images that the slot of the camera dropped.
             camera_fault: why no image comes.
         """
         stream = self._stream
-        # A camera may repeat single images while others leave.
+        # A camera may repeat single images while other frames are sent.
         is_shown = self.image_fault != _NOT_NEWER or not stream.fps(now_us)
         counted = sorted(((name, count) for name, count in (dropped or {}).items() if count), key=lambda item: -item[1])
         return StreamStatus(

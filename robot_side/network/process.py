@@ -58,9 +58,9 @@ def own_addresses() -> list[str]:
     return [address for address in dict.fromkeys(found) if not address.startswith("127.")]
 
 
-# The network process: camera and link; forward raw commands to the driver, publishes for it. Shell.
+# The network process: owns camera and link, forwards raw commands to the driver, publishes its messages. Shell.
 #
-# Started by `sightline.robot_side.pipe` with its ends of two socket pairs; it ends when the first closes.
+# `sightline.robot_side.pipe` starts it with its ends of two socket pairs. It ends when the first one closes.
 
 
 _STREAM_STATUS_US = 200_000
@@ -72,16 +72,16 @@ _LONGEST_NAP_S = 0.1
 _SHORT_NAP_S = 0.01
 _MAX_WAITING_TOKENS = 64  # security limit
 _BETWEEN_MODELS_US = 200_000
-_AWAKE_US = 1_000_000  # after the token of a driver appeared or ended: its subscription to frames comes or changes now
+_AWAKE_US = 1_000_000  # after a driver token appeared or ended, because its subscription to frames changes soon
 _LEAVES_WITHIN_S = 3.0
 _OPENS_WITHIN_S = 20.0
 
 
 class NetworkProcess:
-    """Runs the camera loop (main thread), the driver's packets (a thread) and the link's callbacks (its thread)."""
+    """Runs the camera loop (main thread), the pipe of the driver (a thread) and the callbacks of the link."""
 
     def __init__(self, setup: NetworkSetup, driver: NetworkEnd, link: Link, camera: Camera | None) -> None:
-        """Without a `camera` the camera loop opens it."""
+        """Create it. Without a `camera` the camera loop opens the camera."""
         self._network_end = driver
         self._link = link
         self.camera = camera
@@ -92,11 +92,11 @@ class NetworkProcess:
         self._credit = threading.Event()
         self._camera_fault = setup.camera_fault
         self._no_image_since_us = 0
-        """Begin of the wait for an image that is due; 0 without one. Another thread watches it."""
+        """Start of the wait for an image that is due; 0 if no image is due. Another thread checks it."""
         self._watched_since_us = self._waited_us = self._checked_us = 0
         self._awake_until_us = self._announced_us = 0
         self._tokens: dict[str, bool] = {}
-        """Tokens of drivers, and whether they are present, that found no room in the pipe. Their end ends a lease."""
+        """Driver tokens that wait for room in the pipe -> True if present. The end of a token ends a lease."""
         self._faults_reported: Counter[str] = Counter()
         self._rejection_limiter = RepeatLimiter()
         self._rejected_acks: Counter[str] = Counter()
@@ -118,7 +118,7 @@ class NetworkProcess:
     # --- frames --------------------------------------------------------------------------------------------------
 
     def _stream_one(self) -> None:
-        """Wait for credit, or take an image and publish its frame. The model of the camera is announced before it.
+        """Wait for credit, or take an image and publish its frame, after the model of the camera.
 
         Next: `vision_side/serving/service.py`: `Service.turn`.
         """
@@ -137,13 +137,13 @@ class NetworkProcess:
             return
         header, message = sent
         # The driver process must know a frame before a peer can answer it.
-        # 0 means that the camera is not live; the checksum of an empty image is 0, too.
+        # 0 means a camera that is not live. The checksum of an empty image is 0, too.
         fingerprint = zlib.crc32(picture.jpeg) or 1 if self.camera and self.camera.live else 0
         if self._network_end.send_aside(ipc.pack_issued(header.seq, header.t_us, fingerprint)):
             self._link.publish(message.channel, message.header, message.payload)
 
     def _camera_model(self) -> CameraModel | None:
-        """Return the model of the camera; None without a valid one, which `check_image` reports."""
+        """Return the model of the camera, or None for an invalid one, which `check_image` reports."""
         try:
             model: object = self.camera.model if self.camera else None
         except PLUGIN_ERRORS:
@@ -156,7 +156,7 @@ class NetworkProcess:
             _log.warning("camera: %s%s", self._network_core.image_fault, often)
 
     def _may_capture(self) -> bool:
-        """Return True if the camera may capture now. Otherwise wait briefly, for credit once a frame is due."""
+        """Return True if the camera may capture now. Otherwise wait briefly, for credit if a frame is due."""
         listening = self._link.has_listener(FRAME)
         with self._lock:
             due = self._network_core.may_capture(monotonic_us(), listening)
@@ -166,14 +166,14 @@ class NetworkProcess:
             self._no_image_since_us = 0
             longest_s = _LONGEST_NAP_S if monotonic_us() > self._awake_until_us else _SHORT_NAP_S
             if listening and early_s > 0:
-                time.sleep(min(early_s, longest_s))  # on most links the answer comes now, and would wake for nothing
+                time.sleep(min(early_s, longest_s))  # an answer would only wake this thread too early
             else:
                 self._credit.wait(min(nap_s, longest_s) if listening and nap_s > 0 else longest_s)
             self._credit.clear()
         return due
 
     def _read_camera(self) -> Picture | None:
-        """Return an image or None. A lost camera is logged once and opened again."""
+        """Return an image or None. The loss of the camera is logged once. The camera is then opened again."""
         self._no_image_since_us = self._no_image_since_us or monotonic_us()
         try:
             if self.camera is None:
@@ -204,11 +204,11 @@ class NetworkProcess:
         time.sleep(_CAMERA_RETRY_S)
 
     def _check_camera(self, now_us: int) -> None:
-        """End this process if an image that is due did not come in time: the next one opens the camera again."""
+        """End this process if a due image did not come in time. The next process opens the camera again."""
         step_us, self._checked_us = min(now_us - self._checked_us, _CHECK_STEP_US), now_us
         if self._no_image_since_us != self._watched_since_us:
             self._watched_since_us, self._waited_us = self._no_image_since_us, 0
-        # Short steps, so that the time in which this process was stopped does not count.
+        # Limited steps, so that a time in which this process was stopped does not count.
         self._waited_us += step_us * bool(self._watched_since_us)
         if self._waited_us <= self._setup.camera_patience_us:
             return
@@ -221,19 +221,19 @@ class NetworkProcess:
         os._exit(CAMERA_EXIT)
 
     def close_camera(self) -> None:
-        """Release the camera, if it is open."""
+        """Release the camera if it is open."""
         if self.camera:
             self.camera.close()
 
     # --- the driver ----------------------------------------------------------------------------------------------
 
     def _read_driver(self) -> None:
-        """Read the pipe until the driver process closes it. Then end the camera loop, or the process if it hangs."""
+        """Read the pipe until the driver process closes it. Then end the camera loop, or a process that hangs."""
         status_due_us = 0
         try:
             while packet := self._network_end.receive():
                 self._network_end.retry()
-                with suppress(ValueError):  # a message over its bounds: one lost message
+                with suppress(ValueError):  # a message beyond its limits is lost
                     self._on_packet(packet)
                 now_us = monotonic_us()
                 self._check_camera(now_us)
@@ -258,7 +258,7 @@ class NetworkProcess:
 
     def _report(self, now_us: int) -> None:
         """Send the driver process the state of the stream, and the rejections before the gate."""
-        missed = getattr(self.camera, "missed_captures", None)  # of cameras that capture by themselves
+        missed = getattr(self.camera, "missed_captures", None)  # of cameras with their own capture thread
         with self._lock:
             status = self._network_core.status(
                 now_us, self._network_end.dropped_commands, self._link.dropped, missed() if missed else 0,
@@ -273,8 +273,8 @@ class NetworkProcess:
             self._faults_reported += more
 
     def _report_rejected(self) -> None:
-        """Send the driver the counts of messages that never reached it, so that `status` shows them."""
-        by_link: dict[str, int] = dict(self._link.rejected)  # copied at once: other threads count in it
+        """Send the counts of rejected messages to the driver, so that `status` shows them."""
+        by_link: dict[str, int] = dict(self._link.rejected)  # a copy, because other threads change it
         rejected = Counter(dict(self._rejected_acks)) + Counter(by_link)
         if rejected != self._rejected_reported and self._network_end.send(
             ipc.pack_counts(ipc.PacketKind.REJECTED, rejected)
@@ -293,7 +293,7 @@ class NetworkProcess:
         self._credit.set()
 
     def _send_tokens(self) -> None:
-        """Send the driver process the tokens that wait, as far as there is room now. A flood drops the oldest."""
+        """Send waiting tokens to the driver process while there is room. A flood drops the oldest tokens."""
         with self._lock:
             while len(self._tokens) > _MAX_WAITING_TOKENS:
                 del self._tokens[next(iter(self._tokens))]
@@ -313,7 +313,7 @@ class NetworkProcess:
 
 
 def _open_camera(choice: PluginChoice) -> Camera:
-    """Open the camera at the first start. One that hangs ends the process, because nothing else reports it yet."""
+    """Open the camera at the first start. If it hangs, the process ends, because no other part reports it yet."""
     hanging = threading.Timer(_OPENS_WITHIN_S, _end_hanging, [choice.kind])
     hanging.daemon = True
     hanging.start()
@@ -332,7 +332,7 @@ def _end_hanging(kind: str) -> None:
 def _run(setup: NetworkSetup, driver: NetworkEnd) -> None:
     config = setup.config
     with ExitStack() as ending:
-        # After a restart the link comes first, so that a robot without a camera can be reached.
+        # After a restart the link is opened first, so that a robot without a camera can be reached.
         camera = None if setup.is_restart else _open_camera(config.camera)
         ending.enter_context(limit_floods(config.doors, lambda line: _log.info("robot %s: %s", config.robot, line)))
         if problem := date_problem(config.secure, ROBOT_ROLE):
@@ -354,10 +354,10 @@ def _run(setup: NetworkSetup, driver: NetworkEnd) -> None:
 
 
 def _ignore_exit_signals() -> None:
-    """Survive the signals that a terminal and systemd send to all processes: the driver ends this one, after zero."""
+    """Ignore the signals of terminals and systemd to all processes. The driver ends this process after zero."""
     for number in EXIT_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    # Not ignored: a child of a camera plug-in, e.g. rpicam-vid, would inherit that, and not end by SIGTERM.
+    # A handler, because a child of a camera plug-in, e.g. rpicam-vid, would inherit SIG_IGN and ignore SIGTERM.
     signal.signal(signal.SIGTERM, lambda *_: None)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, EXIT_SIGNALS)
 
@@ -376,7 +376,7 @@ def main() -> None:
         code = error.exit_code
         if setup.is_restart:
             _log.error("robot %s: %s", setup.config.robot, error)
-        else:  # the program ends by it
+        else:  # the normal end of the program
             logging.shutdown()
             print(error_line(str(error)), file=sys.stderr)
     except Exception as error:
@@ -384,7 +384,7 @@ def main() -> None:
         driver.send(ipc.pack_counts(ipc.PacketKind.FAULTS, {"network process": 1}))
     finally:
         logging.shutdown()
-        os._exit(code)  # daemon threads of a transport must not keep a finished process
+        os._exit(code)  # daemon threads of a transport must not block the end
 
 
 if __name__ == "__main__":

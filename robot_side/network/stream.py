@@ -1,18 +1,18 @@
 """Decide when to send a frame: credit, timeouts, rate. Pure.
 
-A frame is captured only with credit, so that it is young when it leaves and no queue grows. An answer (an accepted or
-rejected twist, or an ack) returns credit. The window starts at one frame in flight, and widens only for the delay of
-the link (`congestion_window`), never for a slow detector. With an 80 ms detector, one frame in flight is 81-83 ms old,
-and two are 141-175 ms old. On a slow link the images become smaller (`bitrate_control`).
+A frame is captured only with credit, so it is young when it leaves and no queue grows. An answer (an accepted or
+rejected twist, or an ack) returns credit. The window starts at one frame in flight. It widens only for the delay of the
+link (`congestion_window`), never for a slow detector. With an 80 ms detector, one frame in flight is 81-83 ms old, and
+two are 141-175 ms old. On a slow link the images become smaller (`bitrate_control`).
 
-Loss is not a queue. Frames without an answer between two answers at floor delay are lost. Such losses, and as many in a
-row as they explain, change nothing: the stream continues at its rate. A queue delays the answers, and an outage lasts
-longer. Then the stream slows down.
+Loss is not a queue. Frames without an answer between two answers at floor delay are lost. Such losses, also as many in
+a row as their statistics explain, change nothing: the stream continues at its rate. A queue delays the answers, and an
+outage lasts longer. Then the stream slows down.
 
-Source: BBR (Linux, `net/ipv4/tcp_bbr.c`): the lowest recent delay is the path's own, the data in flight follows from
-it, and a loss is not a signal. WebRTC (draft-ietf-rmcat-gcc-02): a growing delay lowers the rate. Loss has a controller
-of its own there, which a few percent do not trigger. Here no share of loss triggers it, because a slower stream loses
-the same share. Both sources wait for answers. Here a silence decides too, because a robot without commands must stop.
+Sources: BBR (Linux, `net/ipv4/tcp_bbr.c`): the lowest recent delay is that of the path, it gives the data in flight,
+and loss is not a signal. WebRTC (draft-ietf-rmcat-gcc-02): a growing delay lowers the rate. Its separate controller for
+loss ignores a few percent. Here no share of loss counts, because a slower stream loses the same share. Both sources
+wait for answers. Here a silence counts, too, because a robot without commands must stop.
 """
 
 from collections import OrderedDict, deque
@@ -29,14 +29,14 @@ from sightline.robot_side.network.congestion_window import AckSample, Congestion
 _FIRST_TIMEOUT_US = 120_000
 _REMEMBERED = 64
 _TIMEOUT_SLACK_US = 12_000  # with a quick peer, below one interval at 30 fps: a loss then costs one frame, not two
-_PENDING_US = 1_000_000  # a frame that is neither answered nor overtaken for this long was lost
+_PENDING_US = 1_000_000  # a frame without an answer or a newer answer for this long was lost
 # One overdue answer can be a loss. A second one, of a frame that was sent after the first timeout, is a queue.
 _OVERDUE_IN_A_ROW = 2
-# Time without a loss after which the link counts as one without losses again.
+# Time without a loss after which the link counts as free of losses again.
 _LOSS_MEMORY_US = 30_000_000
-# Weight of the earlier losses at each new one. The last fifty decide.
+# Weight of the earlier losses at each new loss. About the last fifty count.
 _LOSS_WEIGHT = 0.98
-# Loss explains a silence that happens at least once in so many losses. Otherwise it is a queue or an outage.
+# Loss explains a silence that is expected at least once in so many losses. Otherwise it is a queue or an outage.
 _LOSSES_PER_SILENCE = 10_000
 # A longer silence is an outage. The robot holds after the same time without a command.
 _LONGEST_LOSS_US = 300_000
@@ -67,7 +67,7 @@ class _Sent:
 
 
 class LossRecord:
-    """Counts the frames that the link lost, and separates them from frames that wait in a queue."""
+    """Counts the frames that the link lost, and distinguishes them from frames in a queue."""
 
     def __init__(self) -> None:
         self._at_floor = False
@@ -95,7 +95,7 @@ class LossRecord:
         return self._at_floor and now_us < self._until_us
 
     def explains(self, overdue: int, silence_us: int, now_us: int) -> bool:
-        """Return True if so many frames without an answer are no more than the link loses in a row.
+        """Return True if the link is expected to lose so many frames in a row.
 
         Args:
             overdue: frames whose answer is overdue, since the last answer.
@@ -104,7 +104,7 @@ class LossRecord:
         """
         if not self.is_recent(now_us):
             return False
-        # The share of lost frames of which the next one was lost too.
+        # Share of the lost frames that were followed by another lost frame.
         again = 1 - self._runs / self._frames
         return silence_us <= _LONGEST_LOSS_US and again**overdue * _LOSSES_PER_SILENCE >= 1
 
@@ -115,8 +115,8 @@ class Stream:
     def __init__(self, config: StreamConfig) -> None:
         self._config = config
         self._interval_us = round(1e6 / config.max_fps)
-        self._in_flight: dict[int, int] = {}  # seq -> when its credit times out
-        self._sent_frames: OrderedDict[int, _Sent] = OrderedDict()  # also of frames whose credit has timed out
+        self._in_flight: dict[int, int] = {}  # seq -> timeout of its credit
+        self._sent_frames: OrderedDict[int, _Sent] = OrderedDict()  # also frames after the timeout of their credit
         self._owner: Holder | None = None
         self._owner_until_us = 0
         self._congestion_window = CongestionWindow(self._interval_us, config.max_window)
@@ -188,8 +188,8 @@ class Stream:
         self._held_back = False
         if len(self._sent_frames) > _REMEMBERED:
             self._sent_frames.popitem(last=False)
-        # The next frame is due by capture time, so that a late send does not reduce the rate. A tenth of slack: a
-        # camera that is slightly faster than `max_fps` must not be read one tick too late.
+        # The next frame is due by capture time, so that a late send does not reduce the rate. With a tenth of slack, a
+        # camera that is slightly faster than `max_fps` is not read one tick too late.
         self._next_us = t_us + self._interval_us * 9 // 10
         self.sent += 1
         self._sent_us.append(now_us)
@@ -211,7 +211,7 @@ class Stream:
         """
         if not self._owns(who, now_us):
             return False
-        # The newest frame wins at the peer, so that frames older than the answered one never get an answer.
+        # The peer uses only the newest frame, so frames older than the answered one never get an answer.
         passed = {old: self._sent_frames.pop(old) for old in tuple(self._sent_frames) if old <= seq}
         if seq in passed:
             self.overtaken += len(passed) - 1
@@ -222,7 +222,7 @@ class Stream:
         return bool(answered)
 
     def release(self) -> None:
-        """Return the credit of all frames in flight. The driver that comes did not receive them."""
+        """Return the credit of all frames in flight, because a new driver did not receive them."""
         self._in_flight.clear()
 
     def on_holder(self, holder: Holder | None, now_us: int) -> None:
@@ -242,14 +242,14 @@ class Stream:
 
     def _hand_over(self, owner: Holder) -> None:
         """Pass the credit to another peer."""
-        # The times and the capacity of the former peer do not apply to a slower successor on another link.
+        # The times and the capacity of the former peer do not apply to a successor on another link.
         self._owner = owner
         self._losses = LossRecord()
         self._answer_us, self._spread_us, self._overdue = None, 0.0, 0
         self._congestion_window = CongestionWindow(self._interval_us, self._config.max_window)
 
     def _measure(self, sent: _Sent, passed: list[_Sent], compute_us: int, now_us: int) -> None:
-        # A negative time would count as a longer link, and widen the window.
+        # A negative computing time would look like a longer link, and widen the window.
         compute_us, answer_us = max(0, compute_us), max(0, now_us - sent.at_us)
         delay_us = max(0, answer_us - compute_us)
         if self._answer_us is None or answer_us <= self._usual_us():
@@ -285,7 +285,7 @@ class Stream:
         """Return the timeout of the next frame in us."""
         longest_us = self._config.max_credit_timeout_ms * 1000
         usual_us = self._usual_us(is_lossy=not self._overdue and self._losses.is_recent(now_us))
-        # It doubles with each further timeout, because a late answer can wait behind the frames in flight.
+        # It doubles with each further timeout, because a late answer may wait behind the frames in flight.
         return min(longest_us, round(usual_us * (1 << min(max(0, self._overdue - 1), 8))))
 
     def _usual_us(self, *, is_lossy: bool = False) -> float:

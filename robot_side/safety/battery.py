@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from sightline.protocol.config import Config
 from sightline.robot_side.safety.states import Cause
 
-# Without a valid reading for longer than this the battery counts as low.
+# Time without a valid reading after which the battery counts as low.
 SILENT_US: Final = 5_000_000
 
 

@@ -39,7 +39,7 @@ from sightline.robot_side.safety.validation import (
 
 # A link that was cut delivers its messages later. An old `arm` must not arm (docs/explanation/decisions/0001).
 _MAX_REQUEST_AGE_US = 2_000_000
-# These verbs only take motion away, so they are safe at any age.
+# These verbs only remove motion, so they are accepted at any age.
 _NEEDS_NO_ECHO = (Verb.STOP, Verb.DISARM, Verb.RELEASE)
 
 
@@ -48,7 +48,7 @@ def _proof_of(header: AnswerHeader | RequestHeader | None) -> Proof:
 
 
 def _shown(holder: Holder | None) -> str:
-    """Name a driver to another one without its session, which a peer could copy."""
+    """Return the name of a driver for other clients, without its session, which a peer could copy."""
     return f"{holder.source} {session_digest(holder.source, holder.session)}" if holder else ""
 
 
@@ -86,10 +86,10 @@ class SafetyGate:
         self.reason = "STOP was set before the restart" if stopped else "not armed"
         self.applied = STILL
         self.is_taken = True
-        """Whether the drive took the twist of the last step."""
+        """True if the drive accepted the twist of the last step."""
         self._sequence = SequenceRecord()
         self._repeats = RepeatRecord()
-        # After so long a silence no command of the holder is in force.
+        # After this silence no command of the holder is in force.
         self._lease = Lease(config.lease_ms * 1000, max(config.silence_ms, config.zero_speed_age_ms) * 1000)
         self._ramp = Ramp(config)
         self._guard = guard
@@ -165,18 +165,18 @@ class SafetyGate:
         if header.echo.channel == "status":
             raise WireError(RejectReason.UNKNOWN_FRAME, "a twist must cite a frame, not a status")
         self.issued.age_us(header.echo, now_us, self.config.max_age_us)
-        # A frozen camera delivers new frames with an old image. The image counts from its first appearance.
+        # A frozen camera delivers new frames with an old image. The age of the image counts from its first appearance.
         age_us = now_us - self.pictures.shown_since_us(header.echo.t_us)
         if age_us > self.config.max_age_us:
             raise WireError(RejectReason.STALE, f"the camera image has not changed for {age_us / 1e3:.0f} ms")
         who = Holder(source=header.source, session=header.session)
-        # Before the number: a copied identity must not use up the numbers of the driver.
+        # Before the sequence number: a copied identity must not use up the numbers of the driver.
         self._check_proof(who, header, now_us)
         self._sequence.check(header, now_us)
         return who, age_us
 
     def _check_proof(self, who: Holder, header: AnswerHeader | RequestHeader, now_us: int) -> None:
-        """Check that the sender is the driver whose session it states."""
+        """Check that the sender owns the session that it states."""
         if self._needs_proof and header.proof is None:
             raise WireError(RejectReason.NOT_PROVEN, "a robot with keys needs a proof in each command")
         self._lease.check_proof(who, _proof_of(header), now_us)
@@ -191,7 +191,7 @@ class SafetyGate:
         if limited != twist:
             self.counters[CLAMPED] += 1
         life_ms = min(config.silence_ms, config.guest_life_ms) if guest else config.silence_ms
-        # Without a header the age of the image is unknown: the command counts from its arrival, and repeats briefly.
+        # Without a header the age of the image is unknown. The age counts from arrival, and repeats are limited.
         if age_us is None:
             self._repeats.add(twist, now_us)
         self._command = AcceptedCommand(limited, now_us - (age_us or 0), now_us, life_ms * 1000, age_us is not None)
@@ -214,16 +214,16 @@ class SafetyGate:
         self._last_step_us = now_us
         self._repeats.drive(self.applied.linear_mps, elapsed_us)
         twist = self._ramp.step(goal, elapsed_us)
-        # The guard comes last and cuts at once: a ramp toward an obstacle would still move the robot closer.
+        # The guard comes last and acts immediately, because a ramp toward an obstacle moves the robot closer.
         if self._guard is not None:
             twist = self._guarded(self._guard, twist, now_us)
         self.applied = twist
         return Decision(twist, self.state, self.reason)
 
     def note_drive(self, before: Twist, *, is_taken: bool) -> None:
-        """Note whether the drive took the twist of the last step. If not, the wheels may still turn as `before` it."""
+        """Note whether the drive accepted the last twist. If not, the wheels may still turn with the twist `before`."""
         self.is_taken = is_taken
-        # A failed attempt to leave zero may have reached one wheel of two.
+        # A failed start from zero may have reached one of the two wheels.
         if not is_taken and before != STILL:
             self.applied = before
 
@@ -283,7 +283,7 @@ class SafetyGate:
     # --- requests ------------------------------------------------------------------------------------------------
 
     def request(self, header: RequestHeader, request: Request, now_us: int) -> str:
-        """Carry out a request.
+        """Apply a request.
 
         Args:
             header: sender and the cited status.
@@ -364,7 +364,7 @@ class SafetyGate:
         return "armed"
 
     def acquire(self, who: Holder, now_us: int, proof: Proof = NO_PROOF) -> str:
-        """Take the lease ahead of the first command, and commit to a chain of proofs. Only commands renew it."""
+        """Take the lease before the first command, and commit to a chain of proofs. Only commands renew the lease."""
         if who.source not in RANKS or not self._lease.may_take(who, now_us, proof):
             raise WireError(RejectReason.NOT_HOLDER, self._why_not(who, self._lease.live_holder(now_us)))
         if self._lease.live_holder(now_us) == who:
@@ -391,7 +391,7 @@ class SafetyGate:
         self._lease.add_token(token)
 
     def end_token(self, token: str, now_us: int) -> bool:
-        """End the lease of the driver with this token, and return True if it held it.
+        """End the lease of the driver with this token. Returns True if that driver held the lease.
 
         Its last command stays in force until it is too old, so that the robot does not stop for a successor.
         """
@@ -436,7 +436,7 @@ class SafetyGate:
 
     def _notice_lost_human(self, now_us: int) -> None:
         """Stop after the loss of a human driver."""
-        # Before another driver may take the lease: one tick later the new holder hides the loss.
+        # Before another driver may take the lease, because one tick later the new holder hides the loss.
         if self._lease.lost_human(now_us):
             self._lease.drop()
             self._end(Event.HUMAN_LOST, "the operator who drove was lost; arm again")
@@ -456,7 +456,7 @@ class SafetyGate:
         self.arms_itself = False
 
     def _leave(self, event: Event, reason: str) -> None:
-        """Go to a state with the wheels off. With auto_arm the robot may arm again from there."""
+        """Go to a state without motion. With auto_arm the robot may arm again from there."""
         if next_state(self.state, event) is not self.state:
             self._command, self._live_commands = None, 0
             self._go(event, reason)

@@ -17,7 +17,7 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import STILL, Twist
 from sightline.robot_side.ports import Ranges
 
-# The first pass reduces the speed. A turn without that speed can approach an earlier point, so the second pass reduces
+# The first pass reduces the speed. Without that speed a turn can approach an earlier point, so the second pass reduces
 # the turn, and the third applies it to all points. At zero speed a smaller turn is safe for every point.
 _PASSES = 3
 
@@ -82,7 +82,7 @@ class RangeGuard:
         self._near: list[_Near] = []
 
     def see(self, scan: Ranges) -> None:
-        """Take a scan, see `Ranges`. An invalid scan is ignored, so that the sensor soon counts as silent.
+        """Process a scan, see `Ranges`. An invalid scan is ignored, so that the sensor soon counts as silent.
 
         Args:
             scan: one turn of the sensor, m and rad.
@@ -103,8 +103,8 @@ class RangeGuard:
         nearest_x_m = max(-config.rear_m, min(config.front_m, x_m))
         nearest_y_m = max(-config.half_width_m, min(config.half_width_m, y_m))
         clearance_m = math.hypot(x_m - nearest_x_m, y_m - nearest_y_m)
-        # A point inside the outline is noise or a part of the robot and has no direction. Ahead or behind is the safe
-        # assumption: it blocks motion toward the point and permits motion away from it.
+        # A point inside the outline is noise or a part of the robot and has no direction. It counts as ahead or behind,
+        # which blocks motion toward the point and permits motion away from it.
         inside = clearance_m < 1e-6
         forward = math.copysign(1.0, x_m) if inside else (x_m - nearest_x_m) / clearance_m
         sideways = 0.0 if inside else (y_m - nearest_y_m) / clearance_m

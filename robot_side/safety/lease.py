@@ -12,8 +12,8 @@ from sightline.protocol.proof import NO_PROOF, Proof, continues, tokens_of
 RANKS = {"guest": 0, "vision": 1, "teleop": 2}
 # After the loss of one of these drivers, the robot stops and must be armed again.
 HUMANS = frozenset({"teleop"})
-# Security limits: tokens of drivers and ended ones, sessions that drive no more, and sessions whose token is known. The
-# token of the holder leaves last.
+# Security limits: present and ended tokens of drivers, fenced sessions, and sessions with a known token. The token of
+# the holder is removed last.
 _MAX_TOKENS, _MAX_FENCED, _MAX_KNOWN = 64, 64, 64
 
 
@@ -33,14 +33,14 @@ class Lease:
     proof: Proof = NO_PROOF
     """The last accepted proof of the holder, which its next command must continue."""
     token: str = ""
-    """The token of the holder, "" without one. Its end is the end of the lease."""
+    """The token of the holder, or "". The end of the token ends the lease."""
     _tokens: OrderedDict[str, None] = field(default_factory=OrderedDict)
     _ended: OrderedDict[str, int] = field(default_factory=OrderedDict)
-    """The newest tokens that ended, and when."""
+    """The newest ended tokens -> end time."""
     _fenced: OrderedDict[Holder, None] = field(default_factory=OrderedDict)
-    """Sessions whose token ended while they held the lease, or that were succeeded. A late command never drives."""
+    """Sessions that lost the lease by the end of their token or to a successor. A late command never drives."""
     _known: OrderedDict[Holder, str] = field(default_factory=OrderedDict)
-    """Tokens of the sessions that held the lease: later proofs no longer show them."""
+    """Sessions that held the lease -> token, because later proofs no longer show it."""
 
     def live_holder(self, now_us: int) -> Holder | None:
         """Return the driver that holds the lease now."""
@@ -51,12 +51,12 @@ class Lease:
         return who in self._fenced
 
     def has_left(self, who: Holder, proof: Proof, now_us: int) -> bool:
-        """Return True for a driver that has just withdrawn its token, which may overtake its last command.
+        """Return True for a driver that has just withdrawn its token. The withdrawal may overtake its last command.
 
         A command that comes later than the life of a lease is too old. Until then no other driver may succeed a session
         without a token.
         """
-        # Others can compute the token of a driver from its proofs. A human must not be kept out by that.
+        # Any client can compute the token of a driver from its proofs, so this must not exclude a human.
         return who.source not in HUMANS and any(
             now_us - self._ended[token] < self.life_us for token in tokens_of(proof.proof) if token in self._ended)
 
@@ -65,7 +65,7 @@ class Lease:
         holder = self.live_holder(now_us)
         if self.is_fenced(who):
             return False
-        # Equal ranks do not succeed a holder that drives: two vision services would alternate at every command.
+        # A holder that drives has no successor of equal rank, because two vision services would alternate.
         if holder == who:
             return True
         if holder is None or RANKS[who.source] > RANKS[holder.source]:
@@ -75,10 +75,10 @@ class Lease:
             and bool(self._token_of(proof))
 
     def check_proof(self, who: Holder, proof: Proof, now_us: int) -> None:
-        """Check that a message which names the holder is of the holder.
+        """Check that a message in the name of the holder comes from the holder.
 
         Raises:
-            WireError: NOT_PROVEN. A peer that has read the holder's session cannot continue its proofs.
+            WireError: NOT_PROVEN. A peer that knows the holder's session cannot continue its proofs.
         """
         if self.live_holder(now_us) == who and self.proof.proof is not None and not continues(proof.proof, self.proof):
             raise WireError(
@@ -96,7 +96,7 @@ class Lease:
         self.holder, self.expires_us, self.proof = who, now_us + self.life_us, proof
 
     def advance(self, who: Holder, proof: Proof, now_us: int) -> None:
-        """Store the proof of a request of the holder, so that no copy of it proves anything."""
+        """Store the proof of a request of the holder, so that a copy of it is not valid again."""
         if self.live_holder(now_us) == who:
             self.proof = proof
 
@@ -105,14 +105,14 @@ class Lease:
         self.holder, self.expires_us, self.proof, self.token = None, 0, NO_PROOF, ""
 
     def add_token(self, token: str) -> None:
-        """Store the token of a driver that may take the lease. It costs no hash: a peer may declare any number."""
+        """Store the token of a driver that may take the lease. It computes no hash, because a peer may send many."""
         self._ended.pop(token, None)
         self._tokens[token] = None
         if len(self._tokens) > _MAX_TOKENS:
             del self._tokens[next(one for one in self._tokens if one != self.token)]
 
     def end_token(self, token: str, now_us: int) -> bool:
-        """Return True if the lease ended with this token. Its session never drives again, also if it was over."""
+        """Return True if this token ended the current lease. Its session never drives again."""
         if token in self._tokens:
             del self._tokens[token]
             self._ended[token] = now_us
@@ -121,7 +121,7 @@ class Lease:
         if not token or token != self.token:
             return False
         is_live = self.live_holder(now_us) is not None
-        self._fence(cast(Holder, self.holder))  # only a holder has a token
+        self._fence(cast(Holder, self.holder))  # a token always has a holder
         self.drop()
         return is_live
 
@@ -130,7 +130,7 @@ class Lease:
         return next((token for token in tokens_of(proof.proof) if token in self._tokens), "")
 
     def _known_token(self, who: Holder) -> str:
-        """Return the token with which a session held the lease before, also if a human drove since, or ""."""
+        """Return the token of an earlier lease of a session, also after a human driver, or ""."""
         token = self._known.get(who, "")
         return token if token in self._tokens else ""
 
@@ -148,5 +148,5 @@ class Lease:
 
     def lost_human(self, now_us: int) -> bool:
         """Return True if a human held the lease and it expired."""
-        # An expired holder stays stored for this question. `drop` ends it after the loss is handled.
+        # An expired holder stays stored for this check. `drop` removes it after the loss is handled.
         return self.holder is not None and self.holder.source in HUMANS and now_us >= self.expires_us

@@ -12,8 +12,8 @@ from sightline.robot_side.safety.battery import BatteryLimits
 
 # Longest time between two ticks of the driver.
 TICK_US = 20_000
-# Shortest time between two ticks for commands. The driver also ticks when a command arrives; a flood of commands must
-# not flood the motors.
+# Shortest time between two ticks for commands. The driver also ticks when a command arrives, but a flood of commands
+# must not flood the motors.
 MIN_TICK_US = 2_000
 STOP_TIME_BOUND_US = 700_000
 STOP_DISTANCE_BOUND_M = 0.25
@@ -21,7 +21,7 @@ STOP_DISTANCE_BOUND_M = 0.25
 # Share of the top speed below which the robot counts as at rest.
 _AT_REST = 0.02
 _LONGEST_STEP_US = 1_000_000
-# No larger twist is scaled, m/s or rad/s. The excess of a huge one would be infinite, and the result zero.
+# Largest twist that is scaled, m/s or rad/s. The ratio of a larger one to the limit could be infinite, the result zero.
 _LARGEST = 1e6
 
 Millis = Annotated[int, Field(ge=20, le=5_000)]
@@ -72,7 +72,7 @@ class SafetyConfig(BatteryLimits):
             raise ValueError("full_speed_age_ms must be below zero_speed_age_ms")
         if self.lease_ms < self.silence_ms:
             raise ValueError("lease_ms must be at least silence_ms, so that no command is in force without its driver")
-        # The bound follows from the values themselves, so that a robot that brakes slowly needs a lower top speed.
+        # The bound follows from the values, so a robot that brakes slowly needs a lower top speed.
         bound = stop_bound(self)
         if bound.zero_us > STOP_TIME_BOUND_US or bound.distance_m > STOP_DISTANCE_BOUND_M:
             raise ValueError(
@@ -138,7 +138,7 @@ class AxisRamp:
             The new speed.
         """
         error = goal - self.speed
-        # The jerk limit never delays the end of an acceleration away from the goal: braking starts at once.
+        # The jerk limit never delays the end of an acceleration away from the goal, so braking starts immediately.
         if self._acceleration * error < 0:
             self._acceleration = 0.0
         # The largest acceleration that still returns to zero within the jerk limit when the goal is reached. A larger
@@ -173,8 +173,8 @@ class Ramp:
         Returns:
             The twist to apply now.
         """
-        # A late step is cut into slices, so that it changes the speed exactly as steps in time would. The bound keeps
-        # the time of one call bounded after a long pause.
+        # A late step is cut into slices, so that the speed changes exactly as with steps in time. A bound limits the
+        # time of one call after a long pause.
         left_us = min(elapsed_us, _LONGEST_STEP_US)
         while left_us > 0:
             slice_us = min(left_us, TICK_US)
@@ -191,8 +191,8 @@ class Ramp:
 
 @dataclass(frozen=True, slots=True)
 class StopBound:
-    """After the last valid command, from top speed: when the set speed starts to fall (`falls_us`), when it is zero
-    (`ramped_us`), when the wheels stand (`zero_us`), and the way until then."""
+    """The stop after the last valid command at top speed: when the set speed starts to fall (`falls_us`), when it is
+    zero (`ramped_us`), when the wheels stand (`zero_us`), and the distance until then."""
 
     falls_us: int
     ramped_us: int
@@ -200,12 +200,12 @@ class StopBound:
     distance_m: float
 
 
-@lru_cache(maxsize=64)  # 5 ms for each configuration, and a process builds the same one several times
+@lru_cache(maxsize=64)  # 5 ms for each configuration, and a process builds the same configuration several times
 def stop_bound(config: SafetyConfig) -> StopBound:
-    """Compute the stop that `config` implies with its own ramp, for the worst case, a command on a frame of age zero.
+    """Compute the stop of `config` with its own ramp, for the worst case, a command on a frame of age zero.
 
-    The driver steps the ramp each TICK_US, and between these down to each MIN_TICK_US while commands arrive. The worse
-    of both counts: the ramp is slower in short steps.
+    The driver steps the ramp each TICK_US, or as often as each MIN_TICK_US while commands arrive. The worse result of
+    both counts, because the ramp is slower in short steps.
     """
     long, short = _stop(config, TICK_US), _stop(config, MIN_TICK_US)
     return StopBound(

@@ -1,6 +1,6 @@
 """Define the states of the gate and their transitions. Pure.
 
-    state      wheels                         left by
+    state      wheels                         ends by
     DISARMED   zero; commands are validated   arm
     HOLD       ramp to zero, then held        a fresh command; ten seconds; disarm
     ACTIVE     apply the command              silence, age; disarm

@@ -15,7 +15,7 @@ _KEPT_PER_CHANNEL = 256
 _KEPT_SENDERS = 64
 _SENDER_MEMORY_US = 10_000_000
 _SeqTable = OrderedDict[tuple[str, str], tuple[int, int]]
-# A year of commands at 100 Hz, and ten hours of lost commands at 30 Hz. A forged number near 2^53 would bar its owner.
+# A year of commands at 100 Hz, and ten hours of lost commands at 30 Hz. A forged number near 2^53 blocks its owner.
 _MAX_FIRST_SEQ, _MAX_SEQ_JUMP = 2**32, 2**20
 # 8 s at 30 fps. A camera that repeats its buffers has up to 32 of them.
 _KEPT_IMAGES = 256
@@ -129,7 +129,7 @@ class IssuedRecord:
         if echo.session != self.session:
             raise WireError(RejectReason.OTHER_SESSION, f"cites robot session {echo.session}, this is {self.session}")
         times = self._times.get(echo.channel, OrderedDict())
-        # The time must match too: a peer that guesses a sequence number must not choose the age.
+        # The time must match, too, because a peer that guesses a sequence number must not choose the age.
         if times.get(echo.seq) != echo.t_us:
             raise WireError(RejectReason.UNKNOWN_FRAME, f"cites {echo.channel} {echo.seq}, unknown to this robot")
         age_us = now_us - echo.t_us
@@ -166,7 +166,7 @@ class FreshnessRecord:
             if len(self._first_us) > _KEPT_IMAGES:
                 self._first_us.popitem(last=False)
         self._newest_us = t_us
-        # Of each frame: a late command may cite the frozen image after the camera delivers new ones again.
+        # For each frame, because a late command may cite the frozen image after the camera delivers new ones again.
         self._shown_us[t_us] = self._first_us[fingerprint]
         if len(self._shown_us) > _KEPT_IMAGES:
             self._shown_us.popitem(last=False)
@@ -181,7 +181,7 @@ class FreshnessRecord:
 
 
 class RepeatRecord:
-    """Stores since when, and how far, the robot drives by one unchanged command without a header."""
+    """Stores how long, and how far, the robot has driven with one unchanged command without a header."""
 
     def __init__(self) -> None:
         self._twist: Twist | None = None
@@ -189,8 +189,8 @@ class RepeatRecord:
         self._driven_m = 0.0
 
     def add(self, twist: Twist, now_us: int) -> None:
-        """Record an accepted command, as it arrived. Only a different one starts again."""
-        # A pause does not start it again: a client that sends in bursts may repeat one old image too.
+        """Record an accepted command at its arrival. Only a different command restarts the record."""
+        # A pause does not restart it, because a client that sends in bursts may repeat one old image, too.
         if twist != self._twist:
             self._twist, self._since_us, self._driven_m = twist, now_us, 0.0
 
@@ -206,7 +206,7 @@ class RepeatRecord:
 class SequenceRecord:
     """Stores the newest sequence number of each (source, session), for a bounded number of senders.
 
-    The senders that held the lease have a table of their own, so that no number of rejected senders evicts them.
+    The senders that held the lease have a separate table, so that rejected senders never remove them.
     """
 
     def __init__(self) -> None:
@@ -222,7 +222,7 @@ class SequenceRecord:
         sender = (header.source, header.session)
         table = self._drivers if sender in self._drivers else self._others
         seq, stored_us = table.get(sender, (-1, 0))
-        # A frame that old is STALE, so nothing of this sender can be replayed.
+        # An older frame is STALE, so a replay is impossible.
         is_known = seq >= 0 and now_us - stored_us <= _SENDER_MEMORY_US
         if is_known and header.seq <= seq:
             raise WireError(RejectReason.OUT_OF_ORDER, f"seq {header.seq} of {header.source} is not newer than {seq}")
@@ -233,7 +233,7 @@ class SequenceRecord:
         _store(table, sender, (header.seq, now_us))
 
     def promote(self, sender: tuple[str, str]) -> None:
-        """Store a sender with the drivers: its last command took or renewed the lease."""
+        """Move a sender to the drivers, after its command took or renewed the lease."""
         if sender in self._others:
             _store(self._drivers, sender, self._others.pop(sender))
 

@@ -26,7 +26,7 @@ class FolderCameraConfig(LensConfig):
 
 
 class FolderCamera:
-    """Images are read once, at start; the stamps are this machine's clock, as if they were seen now."""
+    """Reads all images at start. Their capture times are those of this machine's clock."""
 
     Config = FolderCameraConfig
     live = False
@@ -84,7 +84,7 @@ def _checked_size(path: Path, size: JpegSize) -> JpegSize:
     return size
 
 
-# A camera that shows one JPEG for ever, paced. Shell (a file and a clock).
+# A camera that repeats one JPEG at a fixed rate. Shell (a file and a clock).
 
 
 class StillCameraConfig(LensConfig):
@@ -115,12 +115,12 @@ class StillCamera:
 
 # A camera that plays a video file at its own speed, looped or once. Shell (a file and a clock).
 #
-# OpenCV and simplejpeg are imported when a video is opened; the robot's base install has neither.
+# OpenCV and simplejpeg are imported when a video is opened, because the base install has neither.
 
 
 _USUAL_FPS = 30.0
-_CATCH_UP_S = 1.0  # after a longer pause the video goes on where it was, as if paused
-_COUNT_SLACK = 0.05  # a container may only estimate how many images it holds
+_CATCH_UP_S = 1.0  # after a longer pause the video continues at the same image
+_COUNT_SLACK = 0.05  # the image count of a container may be an estimate
 
 
 class VideoCameraConfig(LensConfig):
@@ -178,7 +178,7 @@ class VideoCamera:
         return True
 
     def close(self) -> None:
-        """Idempotent."""
+        """Release the video. Idempotent."""
         self._capture.release()
 
     # --- the file ------------------------------------------------------------------------------------------------
@@ -202,7 +202,7 @@ class VideoCamera:
         return fps if 0 < fps <= 240 else _USUAL_FPS
 
     def _due(self) -> int:
-        """Return the number of images that the video advanced since the last one shown, at least one."""
+        """Return the number of images that are due since the last shown image, at least one."""
         now_s = time.monotonic()
         ahead = math.floor((now_s - self._started_s) * self._fps + 0.5) - self._shown
         if ahead > _CATCH_UP_S * self._fps or ahead < 1:
@@ -238,7 +238,7 @@ class VideoCamera:
 
 
 def quiet_videos(cv2: Any) -> None:
-    """Let OpenCV and FFmpeg print nothing of their own about a video, unless the environment sets their levels."""
+    """Disable the video messages of OpenCV and FFmpeg, unless the environment sets their levels."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read at the first video
     if "OPENCV_LOG_LEVEL" not in os.environ:
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
@@ -250,5 +250,5 @@ def _packages() -> tuple[Any, Any]:
         import simplejpeg
     except ImportError:
         raise ConfigError(f"camera video needs OpenCV and simplejpeg: {install_command('camera')}") from None
-    quiet_videos(cv2)  # the errors here name the file
+    quiet_videos(cv2)  # the errors of this module name the file
     return simplejpeg.encode_jpeg, cv2

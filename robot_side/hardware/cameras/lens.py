@@ -1,6 +1,7 @@
-"""The lens of a camera plug-in: a calibrated model from a file or from options, else a guess from its angle. Shell.
+"""The lens of a camera plug-in: a calibrated model from a file or options, otherwise a guess. Shell.
 
-The file is what `sightline calibrate camera` writes: the fields of `sightline.protocol.messages.CameraModel` as TOML.
+The file has the format of `sightline calibrate camera`: the fields of `sightline.protocol.messages.CameraModel` as
+TOML.
 """
 
 import json
@@ -30,7 +31,7 @@ class LensConfig(Config):
     def given_model(self) -> CameraModel | None:
         """Return the calibrated model, or None without one.
 
-        Raises ConfigError for a file that cannot be read, a field that is wrong or unknown, and both sources at once.
+        Raises ConfigError for an unreadable file, an invalid or unknown field, and two sources.
         """
         if self.model_file is not None and self.model is not None:
             raise ConfigError("camera options model and model_file are both set; keep one")
@@ -42,7 +43,7 @@ class LensConfig(Config):
 def camera_model(config: LensConfig, size: JpegSize) -> CameraModel:
     """Return the model of images of `size`.
 
-    Raises ConfigError as `given_model`, and for a model of another size: a camera may crop, so nothing is scaled.
+    Raises ConfigError as `given_model`, and for a model of another size. A camera may crop, so no model is scaled.
     """
     given = config.given_model()
     if given is None:
@@ -71,13 +72,13 @@ def read_model(path: Path) -> CameraModel:
         raise ConfigError(
             f"{path}: cannot be read: {error.strerror}; `sightline calibrate camera` writes one"
         ) from None
-    except (ValueError, RecursionError) as error:  # also a number of too many digits
+    except (ValueError, RecursionError) as error:  # also for a number with too many digits
         raise ConfigError(f"{path}: invalid TOML: {error}") from None
     return _checked(table, str(path))
 
 
 def _checked(table: dict[str, Any], where: str) -> CameraModel:
-    """Check the fields of a file. An unknown field is an error here, while on the wire it comes from a newer peer."""
+    """Check the fields of a file. An unknown field is an error, while on the wire it may come from a newer peer."""
     unknown = sorted(set(table) - set(CameraModel.model_fields))
     if unknown:
         known = ", ".join(CameraModel.model_fields)

@@ -1,4 +1,4 @@
-"""A Raspberry Pi camera through picamera2: the hardware encoder's JPEGs, the sensor's own times. Shell (threads).
+"""A Raspberry Pi camera through picamera2: JPEGs of the hardware encoder, times of the sensor. Shell (threads).
 
 picamera2 comes from apt on a Raspberry Pi (python3-picamera2) and is imported when the camera is opened.
 """
@@ -18,7 +18,7 @@ _LIST = "`rpicam-hello --list-cameras` lists what is connected"
 
 
 class PiCameraConfig(LensConfig):
-    """`bitrate_mbit_s` sets the JPEG quality: 8 is about 33 kB an image at 30 fps. 62 degrees is Camera Module 2."""
+    """`bitrate_mbit_s` sets the JPEG quality: 8 is about 33 kB per image at 30 fps. 62 degrees: Camera Module 2."""
 
     index: Annotated[int, Field(ge=0, le=3)] = 0
     width_px: Annotated[int, Field(ge=64, le=4096)] = 640
@@ -28,12 +28,12 @@ class PiCameraConfig(LensConfig):
     upside_down: bool = False
     hfov_deg: Annotated[float, Field(gt=5, lt=175)] = 62.0
     delay_ms: Annotated[float, Field(ge=0, le=1000)] = 30.0
-    """Age of an image when it is encoded, ms, if the sensor gives no usable time."""
+    """Age of an image at its encoding, ms, if the sensor gives no valid time."""
     frozen_after_s: Annotated[float, Field(ge=0.2, le=2)] = 2.0
 
 
 class PiCamera:
-    """Holds the newest image. picamera2 captures and encodes on its own threads."""
+    """Stores the newest image. picamera2 captures and encodes on its own threads."""
 
     Config = PiCameraConfig
     live = True
@@ -66,7 +66,7 @@ class PiCamera:
         self._camera.start_recording(self._encoder, _output(self))
 
     def encoded(self, jpeg: bytes, since_first_us: int | None) -> None:
-        """Store the image and return. Runs on the thread of the encoder, whose times count from the first image."""
+        """Store the image. The thread of the encoder calls this; its times count from the first image."""
         first_us = getattr(self._encoder, "firsttimestamp", None)
         stamp_us = 0 if first_us is None or since_first_us is None else first_us + since_first_us
         t_us = self._stamps.captured_us(stamp_us, read_clocks())
@@ -88,7 +88,7 @@ class PiCamera:
         return self._newest.dropped
 
     def close(self) -> None:
-        """Idempotent."""
+        """Close the camera. Idempotent."""
         camera, self._camera = self._camera, None
         if camera is not None:
             camera.stop_recording()
@@ -115,7 +115,7 @@ def _opened(config: PiCameraConfig) -> Any:
 
 
 def _output(camera: PiCamera) -> Any:
-    """Return the output of the encoder. Its base class exists only where picamera2 is installed."""
+    """Return the output of the encoder. Its base class exists only with picamera2 installed."""
     from picamera2.outputs import Output
 
     class ToCamera(Output):  # type: ignore[misc]

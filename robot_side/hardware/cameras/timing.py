@@ -1,7 +1,7 @@
 """Capture times from driver stamps, a frame timer for files, and the slot of the latest image. Shell (clocks).
 
-A stamp taken when the image is read makes one that lay in the driver's queue look young. Drivers stamp with the
-monotonic clock, some with the clock of the day or with the time since boot; some do not stamp at all.
+A time taken at the reading of an image hides the time that it waited in the driver's queue. Most drivers stamp with the
+monotonic clock, some with the wall clock or the time since boot. Some drivers do not stamp at all.
 """
 
 import time
@@ -11,14 +11,14 @@ from sightline.protocol.clock import heartbeat_us, monotonic_us
 from sightline.protocol.transports.link import LatestSlot
 from sightline.robot_side.ports import Picture
 
-_RUNNING = 0  # the clock that stops in suspend, in the order in which clocks are tried
-_SHORTEST_SUSPEND_US = 50_000  # a shorter one makes no image look young
-_OLDEST_US = 2_000_000  # until its clock is known, what seems older than this was stamped by another
+_RUNNING = 0  # index of the clock that stops in suspend; clocks are tried in this order
+_SHORTEST_SUSPEND_US = 50_000  # a shorter suspend is ignored
+_OLDEST_US = 2_000_000  # while the clock is unknown, a larger age means another clock
 
 
 @dataclass(frozen=True, slots=True)
 class Clocks:
-    """The same moment on each clock that a driver may stamp with: since boot, less suspend, of the day."""
+    """The same moment on each clock of drivers: since boot, without suspend, wall clock."""
 
     boot_us: int
     running_us: int
@@ -26,7 +26,7 @@ class Clocks:
 
 
 class CaptureClock:
-    """Which clock a device stamps with. One for each opening of a device: another may be plugged in."""
+    """Detects the clock of a device's stamps. Each opening of a device needs a new object."""
 
     def __init__(self, delay_us: int) -> None:
         """Take `delay_us`, the assumed age of an image without a usable stamp."""
@@ -36,10 +36,10 @@ class CaptureClock:
         self._resumed_us: int | None = None
 
     def captured_us(self, stamp_us: int, now: Clocks) -> int:
-        """Time of capture, on the robot's clock, of a buffer stamped `stamp_us` and read `now`.
+        """Return the capture time on the robot's clock of a buffer with `stamp_us`, read at `now`.
 
-        The first clock on which a stamp lies in the last two seconds is the device's. From then on its stamps are
-        believed, however old the images have grown in the driver's queue, unless one is from that clock's future.
+        The device uses the first clock on which a stamp is at most two seconds old. From then on any age of its stamps
+        is accepted, even after a long wait in the driver's queue, but not a stamp in the future.
         """
         ages_us = [now.running_us - stamp_us, now.boot_us - stamp_us, now.day_us - stamp_us]
         if self._known is None or ages_us[self._known] < 0:
@@ -50,9 +50,9 @@ class CaptureClock:
         return now.boot_us - (age_us if age_us >= 0 else self._delay_us)
 
     def _asleep_us(self, stamp_us: int, now: Clocks) -> int:
-        """Return the time in suspend since `stamp_us`, which the clock of that stamp lacks.
+        """Return the time in suspend since `stamp_us`, which the clock of that stamp does not count.
 
-        A buffer that was filled before the first reading after a suspend may be from before it, and counts as such.
+        A buffer that was filled before the first reading after a suspend may be older, and counts as older.
         """
         suspended_us = now.boot_us - now.running_us
         if self._suspended_us is None or suspended_us - self._suspended_us <= _SHORTEST_SUSPEND_US:
@@ -64,7 +64,7 @@ class CaptureClock:
         return suspended_us - self._suspended_us
 
 
-# The robot's clocks, and a rhythm for sources that have none of their own, such as files. Shell (clocks).
+# The robot's clocks, and a frame timer for sources without a clock, such as files. Shell (clocks).
 
 
 class FrameTimer:
@@ -91,16 +91,16 @@ def read_clocks() -> Clocks:
     return Clocks(monotonic_us(), heartbeat_us(), time.time_ns() // 1000)
 
 
-# The newest image of a camera that captures by itself. Shell (a lock and a clock).
+# The newest image of a camera with its own capture thread. Shell (a lock and a clock).
 
 
 _JUST_NOW_S = 0.008
-"""Maximum age of a stored image that `read` still returns. A longer time returns old images instead of the next one.
+"""Largest age of a stored image that `read` returns. With a longer time it returns old images instead of the next one.
 With a shorter time, a reader that is slightly late gets only every second image."""
 
 
 class LatestPicture:
-    """One place: the reader thread puts, `take` waits."""
+    """Slot for one image: the reader thread calls `put`, `take` waits."""
 
     def __init__(self) -> None:
         self._slot: LatestSlot[tuple[float, Picture]] = LatestSlot()
@@ -111,11 +111,11 @@ class LatestPicture:
         return self._slot.dropped
 
     def put(self, picture: Picture) -> None:
-        """Replace whatever is there; never blocks."""
+        """Replace the stored image; never blocks."""
         self._slot.put((time.monotonic(), picture))
 
     def take(self, timeout_s: float) -> Picture | None:
-        """Take the image that has just arrived, else the next one. Returns None if none arrives within `timeout_s`."""
+        """Take an image that has just arrived, otherwise the next one. Returns None if none arrives in `timeout_s`."""
         stored = self._slot.take()
         if stored is not None and time.monotonic() - stored[0] <= _JUST_NOW_S:
             return stored[1]

@@ -1,4 +1,4 @@
-"""A V4L2 camera through OpenCV: JPEGs passed through, capture times, reconnection, diagnosis. Shell."""
+"""A V4L2 camera through OpenCV: unchanged JPEGs, capture times, reconnection, diagnosis. Shell."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SET: Final = "set camera.options.device, after --camera with --camera-set devic
 
 
 def check_device(path: Path) -> None:
-    """Raise HardwareError if `path` is absent, not a device, or not permitted. OpenCV reports only "failed"."""
+    """Raise HardwareError if `path` is missing, not a device, or not permitted. OpenCV reports only "failed"."""
     try:
         descriptor = os.open(path, os.O_RDWR | os.O_NONBLOCK)
     except OSError as error:
@@ -40,7 +40,7 @@ def check_device(path: Path) -> None:
 
 
 def open_error(path: Path) -> HardwareError:
-    """Return the error of a device that exists and is permitted, but did not open as a camera."""
+    """Return the error of an existing and permitted device that did not open as a camera."""
     owner = device_owner(path)
     if owner:
         return HardwareError(f"camera {path} is busy: {owner} has it open; end that program")
@@ -51,7 +51,7 @@ def open_error(path: Path) -> HardwareError:
 
 
 def device_owner(path: Path) -> str:
-    """Return the other process that has `path` open, e.g. `cheese (pid 4711)`, or "" if the system does not show it."""
+    """Return another process that has `path` open, e.g. `cheese (pid 4711)`, or "" if the system hides it."""
     return process_with_open({str(path.resolve())}, besides=os.getpid())
 
 
@@ -83,17 +83,17 @@ def _group(path: Path) -> str:
     return group if group != "root" else "video"
 
 
-# An open V4L2 device, through OpenCV: its format pinned, its JPEGs undecoded, its buffers' times. Shell.
+# An open V4L2 device, through OpenCV: fixed format, undecoded JPEGs, times of the buffers. Shell.
 #
-# OpenCV is imported when a device is opened; the robot's base install has none.
+# OpenCV is imported when a device is opened, because the base install does not have it.
 
 
-_SELECT_TIMEOUT_S = 2  # OpenCV waits this long for an image; its own default of 10 would hide a frozen camera
+_SELECT_TIMEOUT_S = 2  # longest wait of OpenCV for an image; its default of 10 would hide a frozen camera
 _SOI, _EOI = b"\xff\xd8", b"\xff\xd9"
 
 
 class V4l2CameraConfig(LensConfig):
-    """`device` may also be a stable name, /dev/v4l/by-id/...; `quality` and the copy it costs are for YUYV only."""
+    """`device` may also be a stable name, /dev/v4l/by-id/...; `quality` applies to YUYV only."""
 
     device: Path = Path("/dev/video0")
     format: Literal["MJPG", "YUYV"] = "MJPG"
@@ -103,13 +103,13 @@ class V4l2CameraConfig(LensConfig):
     fps: Annotated[float, Field(gt=0, le=240)] = 30.0
     quality: Annotated[int, Field(ge=10, le=100)] = 80
     delay_ms: Annotated[float, Field(ge=0, le=1000)] = 30.0
-    """Age of an image when it is read, ms, for drivers without a usable time."""
+    """Age of an image at its reading, ms, for drivers without a valid time."""
     frozen_after_s: Annotated[float, Field(ge=0.2, le=2)] = 2.0
-    """Time without an image after which the camera counts as frozen; after 2 s another process opens it."""
+    """Time without an image after which the camera counts as frozen; after 2 s a new process opens it."""
 
 
 Capture = Any
-"""Shaped like `cv2.VideoCapture`: isOpened, set, get, grab, retrieve, release."""
+"""The interface of `cv2.VideoCapture`: isOpened, set, get, grab, retrieve, release."""
 
 
 def open_capture(path: Path) -> Capture:
@@ -119,7 +119,7 @@ def open_capture(path: Path) -> Capture:
     """
     check_device(path)
     os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(_SELECT_TIMEOUT_S))
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # the errors here replace its warnings
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # the errors of this module replace its warnings
     cv2 = _opencv()
     capture = cv2.VideoCapture(str(path), cv2.CAP_V4L2)
     if not capture.isOpened():
@@ -136,12 +136,12 @@ def _opencv() -> Any:
 
 
 class V4l2Device:
-    """One opening of a device. Raises HardwareError if it rejects the requested format, or is gone."""
+    """One open device. Raises HardwareError if it rejects the requested format, or is gone."""
 
     def __init__(self, config: V4l2CameraConfig, opening: Callable[[Path], Capture]) -> None:
         self._config = config
         self.wish = (100, 100)
-        """Set shares of the configured quality and side lengths, for YUYV, whose images are encoded here."""
+        """Requested shares of the configured quality and side lengths, for YUYV images, which are encoded here."""
         self._stamps = CaptureClock(round(config.delay_ms * 1000))
         self._capture = opening(config.device)
         try:
@@ -180,7 +180,7 @@ class V4l2Device:
         raise self._error(f"gives {given}, not {self._config.format}; set camera.options.format to MJPG or YUYV")
 
     def wait(self) -> None:
-        """Wait for the next capture and take it from the driver; microseconds of CPU."""
+        """Wait for the next capture and take it from the driver. It takes microseconds of CPU."""
         if not self._capture.grab():
             if not self._config.device.exists():
                 raise self._error("was unplugged; plug it in again")
@@ -218,7 +218,7 @@ class V4l2Device:
         return Picture(jpeg, t_us, scale_percent)
 
     def close(self) -> None:
-        """Idempotent."""
+        """Release the device. Idempotent."""
         self._capture.release()
 
     def _error(self, what: str) -> HardwareError:
@@ -238,18 +238,18 @@ def _fourcc_text(code: int) -> str:
     return text if text.isalnum() else f"format {code:#x}"
 
 
-# A USB or built-in camera through V4L2: its own JPEGs and times, its own thread, unplugged and plugged in. Shell.  The
-# thread takes every capture from the driver, so that no old image waits there. It copies one only for a waiting reader.
+# A USB or built-in camera through V4L2: its own JPEGs and times, a separate thread, reconnection. Shell. The thread
+# takes every capture from the driver, so that no old image waits there. It copies an image only for a waiting reader.
 
 
 _RETRY_S = 0.5
-_INTEREST_S = 1.0  # after the last `read`, captures are copied for this long
+_INTEREST_S = 1.0  # time after the last `read` in which captures are copied
 _FIRST_PICTURE_S = 5.0  # some cameras take seconds to start
 _CLOSING_S = 2.5
 
 
 class V4l2Camera:
-    """Open the device. `open_capture` returns a `cv2.VideoCapture`, or a substitute in tests."""
+    """Opens the device. `open_capture` returns a `cv2.VideoCapture`, or a substitute in tests."""
 
     Config = V4l2CameraConfig
     live = True
@@ -300,7 +300,7 @@ class V4l2Camera:
         return picture
 
     def adjust(self, quality_percent: int, scale_percent: int) -> bool:
-        """Adjust the encoding of YUYV images, see `Adjustable`. MJPG stays as the camera encodes it."""
+        """Change the encoding of YUYV images, see `Adjustable`. MJPG images stay unchanged."""
         self._wish = (quality_percent, scale_percent)
         return self._config.format == "YUYV"
 
@@ -309,7 +309,7 @@ class V4l2Camera:
         return self._newest.dropped
 
     def close(self) -> None:
-        """Idempotent; the device is released by its thread, which a frozen driver can hold up."""
+        """Request the end. Idempotent. The camera thread releases the device, which a frozen driver can delay."""
         self._ending.set()
         self._thread.join(_CLOSING_S)
 
@@ -321,7 +321,7 @@ class V4l2Camera:
                 self._capture_one()
             except HardwareError as error:
                 self._fail(error)
-            except Exception as error:  # OpenCV raises its own for what a broken driver hands over
+            except Exception as error:  # OpenCV raises its own errors for invalid data of a broken driver
                 self._fail(HardwareError(f"camera {self._config.device} failed: {report_fault('camera', error)}"))
         self._release()
 
