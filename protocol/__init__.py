@@ -1,7 +1,7 @@
 """The wire contract: channels, messages, codecs and the transports that carry them.
 
 May import: no other package of Sightline.
-Interface: `channels`, `messages` and `codec` for what crosses the network; `transports.open.open_link` for a `Link`.
+Interface: `channels`, `messages` and `codec` for data on the network; `transports.open.open_link` for a `Link`.
 """
 
 from typing import Final
@@ -9,6 +9,6 @@ from typing import Final
 VERSION: Final = 1
 """Wire protocol version; the `v` of every header."""
 NAME_PATTERN: Final = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}"
-"""Of a robot id, and of the name of a vision service."""
+"""Pattern of a robot id, and of the name of a vision service."""
 ROLE_PATTERN: Final = r"[a-z][a-z0-9_]{0,15}"
-"""Of a `source`."""
+"""Pattern of a `source`."""

@@ -66,7 +66,7 @@ class Channel:
     when_full: str = "a newer message replaces it"
     """Rule for a message that cannot leave immediately."""
     passed_on: bool = False
-    """True if the robot forwards the message unchanged to every other peer that wants it."""
+    """True if the robot forwards the message unchanged to every other peer that subscribes to it."""
     while_watched: bool = False
     """True if a peer publishes it only while a viewer subscribes, which saves the encoding."""
     published_by: tuple[str, ...] = ()
@@ -137,7 +137,7 @@ CHANNELS: dict[str, Channel] = {
 _SOURCE = re.compile(ROLE_PATTERN)
 
 
-@lru_cache(maxsize=1024)  # used for each message; after an idle camera period the pattern alone costs 50 us
+@lru_cache(maxsize=1024)  # called for each message; with cold caches the pattern alone costs 50 us
 def key_for(robot: str, channel: Channel, source: str = "") -> str:
     """Return the exact key of a channel.
 
@@ -157,7 +157,7 @@ def key_for(robot: str, channel: Channel, source: str = "") -> str:
 
 
 def pattern_for(robot: str, channel: Channel) -> str:
-    """Return the key expression that a subscriber of `channel` declares. It still checks received keys exactly."""
+    """Return the key expression for a subscriber of `channel`. The subscriber still checks received keys exactly."""
     tail = "/*" if channel.has_source else ""
     return f"{KEY_PREFIX}/{check_robot_id(robot)}/{channel.name}{tail}"
 

@@ -1,33 +1,33 @@
-"""The clocks of this machine, and the age of stamps from a robot's clock. Shell (clocks)."""
+"""The clocks of this machine, and the age of times from a robot's clock. Shell (clocks)."""
 
 import time
 from typing import Final
 
-# Linux alone has this clock. On other systems the clock of heartbeats is all there is.
+# Only Linux has this clock. Other systems use the heartbeat clock.
 _WITH_SUSPEND: Final = getattr(time, "CLOCK_BOOTTIME", None)
 
 
 def monotonic_us() -> int:
-    """Return the microseconds since a fixed moment, those in suspend included: a frame ages while the robot sleeps."""
+    """Return the microseconds since a fixed moment, including suspend, because a frame ages in suspend, too."""
     return heartbeat_us() if _WITH_SUSPEND is None else time.clock_gettime_ns(_WITH_SUSPEND) // 1000
 
 
 def heartbeat_us() -> int:
-    """Return the microseconds for which this machine has run. In suspend neither end of a heartbeat is late."""
+    """Return the microseconds for which this machine has run. After a suspend no heartbeat is late."""
     return time.monotonic_ns() // 1000
 
 
 # The time of a robot's messages, measured on this machine's clock without synchronization. Pure.
 #
 # The delay of the fastest message of a session cannot be separated from the offset of the clocks. Ages are therefore
-# lower bounds; they lack the shortest one-way delay of the link.
+# lower bounds: they do not contain the shortest one-way delay of the link.
 
 
 AHEAD_US: Final = 500_000
-"""Largest lead of a message over the fastest one: its time cannot be true. More than clocks and links of one robot
-differ, and short enough to steer again within a second after a forged message."""
+"""Largest lead of a message over the fastest one. A larger lead is false, because clocks and links of one robot differ
+less. It is short enough to steer again within a second after a forged message."""
 _PROVEN_US: Final = 300_000
-"""Another time of a session replaces the current one after messages over this long, during which that one is silent."""
+"""Duration of messages with other times after which they replace the current times, if those are silent meanwhile."""
 _DRIFT: Final = 5_000
 """Two quartz clocks differ by less than 1 in 5000."""
 _FRAMES_PER_S: Final = 1_000
@@ -40,12 +40,12 @@ class _Timeline:
         self.offset_us = now_us - t_us
         self.received_us = self._begun_us = now_us
         self._undrifted_us = 0
-        """Time without its drift yet: between two messages the drift may be less than 1 us."""
+        """Time whose drift is not added yet, because between two messages the drift may be less than 1 us."""
         self._begun_t_us = self._t_us = t_us
         self._seq = seq
 
     def fits(self, seq: int, t_us: int, now_us: int) -> bool:
-        """Return True unless a message runs ahead, or goes back further than a link delays."""
+        """Return True unless a message runs ahead, or goes back further than a link can delay it."""
         most = self._seq + _FRAMES_PER_S + (now_us - self.received_us) * _FRAMES_PER_S // 1_000_000
         return self._t_us - AHEAD_US <= t_us <= now_us - self.offset_us + AHEAD_US and seq <= most
 
@@ -57,22 +57,22 @@ class _Timeline:
 
     @property
     def is_proven(self) -> bool:
-        """Return True if time passed in its messages as it passed here."""
+        """Return True if its messages cover enough time on both clocks."""
         return min(self.received_us - self._begun_us, self._t_us - self._begun_t_us) >= _PROVEN_US
 
 
 class RobotClock:
-    """Estimates the offset of one robot's clock, separately for each session, and bounds what its messages state."""
+    """Estimates the offset of one robot's clock, separately for each session, and rejects false times."""
 
     def __init__(self) -> None:
         self._session = ""
         self._current: _Timeline | None = None
         self._other: _Timeline | None = None
         self.replaced = 0
-        """How often another time of one session replaced a current one that was not true."""
+        """Number of replacements of false current times by other times of the same session."""
 
     def update(self, session: str, t_us: int, now_us: int, seq: int = 0) -> bool:
-        """Learn from a message.
+        """Process the time of a message.
 
         Args:
             session: session of the robot.
@@ -81,7 +81,7 @@ class RobotClock:
             seq: its sequence number, 0 if messages of several channels are mixed.
 
         Returns:
-            False for a message whose time or number runs ahead of what this clock allows, or goes far back.
+            False for a message whose time or number runs ahead of this clock, or goes back too far.
         """
         if session != self._session:
             self._session, self._current, self._other = session, None, None
@@ -93,7 +93,7 @@ class RobotClock:
         return self._replaces(self._current, seq, t_us, now_us)
 
     def _replaces(self, current: _Timeline, seq: int, t_us: int, now_us: int) -> bool:
-        """Collect messages of another time. They replace the current time if they last and that one is silent."""
+        """Collect messages with other times. They replace the current times if they last and those are silent."""
         if self._other is None or not self._other.fits(seq, t_us, now_us):
             self._other = _Timeline(seq, t_us, now_us)
         self._other.extend(seq, t_us, now_us)

@@ -1,6 +1,6 @@
-"""The base of configuration models, the loader of plug-ins, a validation error as one line. Shell (imports plug-ins).
+"""The base class of configurations, the loader of plug-ins, and one-line validation errors. Shell (imports plug-ins).
 
-A plug-in is named by an entry point of a group, or, from a configuration or a command line only, as
+The name of a plug-in is an entry point of its group. A configuration or command line may also name
 `package.module:Name`. A message never names code.
 """
 
@@ -27,22 +27,22 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 PLUGIN_ERRORS: Final = (Exception, SystemExit)
-"""Errors of a plug-in's own code: `sys.exit` in it is to end itself, not the service around it."""
+"""Errors of plug-in code. A `sys.exit` in a plug-in must end only the plug-in, not the service."""
 _LONGEST_DETAIL: Final = 160
 _log: Final = logging.getLogger(__name__)
 _HERE: Final = Path(__file__).resolve().parent
 _CLASS: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d]\w*")
 _OLD_PACKAGES: Final = ("protocol", "robot_side", "vision_side", "sim", "operator_side", "benchmarks")
-"""Those that stood at the top until they moved below `sightline`."""
+"""Packages that were at the top level before they moved below `sightline`."""
 _OLD_MODULE: Final = re.compile(rf"(?<![\w.])((?:{'|'.join(_OLD_PACKAGES)})(?:\.\w+)*)")
 
 
 class Config(BaseModel):
-    """Frozen; unknown keys, nan and inf are errors. Units are in the names, bounds in the fields."""
+    """Base of configurations. Frozen; unknown keys, nan and inf are errors. Names contain units, fields limits."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
     renamed_keys: ClassVar[Mapping[str, str]] = {}
-    """Keys of the release before, each with its new name. They are accepted for one release, with one warning."""
+    """Old key -> new key. The last release used the old keys. They are accepted for one release, with one warning."""
 
     @model_validator(mode="before")
     @classmethod
@@ -58,7 +58,7 @@ class Config(BaseModel):
 
 @cache
 def warn_renamed(noun: str, old: str, new: str) -> None:
-    """Log once that a name which is still accepted has changed."""
+    """Log once that an accepted name has changed."""
     _log.warning("%s %r is now %r; rename it", noun, old, new)
 
 
@@ -66,11 +66,11 @@ def first_problem(error: ValidationError, noun: str = "", known: Iterable[str] =
     """Format the first problem of a validation as one line.
 
     Args:
-        noun: what a field is called, e.g. "option"; without one the line begins with the field's place and a colon.
-        known: the names that an unknown field should have been one of.
-        whole: the place of a problem that has none of its own.
+        noun: the term for a field, e.g. "option". Without it the line begins with the place of the field and a colon.
+        known: the valid names, for an unknown field.
+        whole: the place of a problem without its own place.
     """
-    # A misspelt field before a missing one: it is usually both.
+    # A misspelled field comes before a missing one, because it usually causes both errors.
     problems = error.errors(include_url=False, include_context=False)
     first = min(problems, key=lambda one: one["type"] != "extra_forbidden")
     place = ".".join(str(part) for part in first["loc"]) or whole
@@ -93,19 +93,19 @@ def _entries(group: str) -> "dict[str, EntryPoint]":
 
 @dataclass(frozen=True, slots=True)
 class PluginRegistry:
-    """One kind of plug-in: what it is called, and the group of entry points that name it."""
+    """One kind of plug-in: its term, and its group of entry points."""
 
     noun: str
     group: str
     also: tuple[str, ...] = ()
-    """Names that stand beside those of the plug-ins in an error, and that `load` does not take."""
+    """Further names for the error text, which `load` does not accept."""
 
     def names(self) -> list[str]:
         """Return every name that `load` accepts."""
         return sorted(_entries(self.group))
 
     def load(self, kind: str) -> Any:
-        """Import what is called `kind`. Raises ConfigError, one line, for an unknown one and for a broken one."""
+        """Import the plug-in `kind`. Raises ConfigError, one line, for an unknown or a broken plug-in."""
         entry = _entries(self.group).get(kind)
         try:
             with _old_packages_missing():
@@ -113,8 +113,8 @@ class PluginRegistry:
                     return entry.load()
                 if _CLASS.fullmatch(kind):
                     return _imported(kind)
-        except PLUGIN_ERRORS as error:  # in a plug-in's own import
-            if not isinstance(error, ImportError | AttributeError):  # those name what is missing
+        except PLUGIN_ERRORS as error:  # from the import of a plug-in
+            if not isinstance(error, ImportError | AttributeError):  # these errors name the missing part
                 report_ending(self.noun, error)
             hint = "" if entry is not None else self._hint(kind)
             raise ConfigError(f"{self.noun} {kind!r} cannot be loaded: {_why(error, kind)}{hint}") from None
@@ -139,7 +139,7 @@ class PluginRegistry:
 
 
 def config_model(plugin: Any) -> type[BaseModel] | None:
-    """Return the `Config` of the class."""
+    """Return the `Config` of the class, or None without one."""
     settings = getattr(plugin, "Config", None)
     return settings if isinstance(settings, type) and issubclass(settings, BaseModel) else None
 
@@ -147,8 +147,8 @@ def config_model(plugin: Any) -> type[BaseModel] | None:
 def _imported(path: str) -> Any:
     import importlib
 
-    if str(Path.cwd()) not in sys.path:  # a class of one's own lies where the service is started
-        sys.path.append(str(Path.cwd()))  # last: a file there is not to stand in for what is installed
+    if str(Path.cwd()) not in sys.path:  # a user's class is in the folder where the service starts
+        sys.path.append(str(Path.cwd()))  # last, so that a file there does not replace an installed module
     module, _, name = path.partition(":")
     found = importlib.import_module(module)
     if not hasattr(found, name):
@@ -159,11 +159,11 @@ def _imported(path: str) -> Any:
 
 
 class _OldPackages:
-    """Finds none of our packages under its old name, which in a checkout would be a second copy of it."""
+    """An import finder that rejects the old names of these packages, which a checkout would import a second time."""
 
     @staticmethod
     def find_spec(name: str, _path: object = None, _target: object = None) -> None:
-        """Raises ModuleNotFoundError for an old name, unless another project's package has it."""
+        """Raise ModuleNotFoundError for an old name, unless a package of another project has it."""
         if name not in _OLD_PACKAGES:
             return
         found = PathFinder.find_spec(name)
@@ -181,7 +181,7 @@ def _old_packages_missing() -> Iterator[None]:
 
 
 def _why(error: BaseException, kind: str) -> str:
-    """Return what failed; for a module that moved, its new name."""
+    """Return the cause of the error; for a module that moved, its new name."""
     if isinstance(error, ModuleNotFoundError) and error.name and _OLD_MODULE.fullmatch(error.name):
         named = next(filter(None, map(_OLD_MODULE.search, (*_lines(error.__traceback__), kind))), None)
         if named is not None:

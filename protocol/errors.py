@@ -1,5 +1,5 @@
-"""Reasons for rejecting a message, and every exception that Sightline raises on purpose. Pure but for `home_path`
-and `install_command`, which read where homes are and what is installed.
+"""Reasons for rejecting a message, and every exception that Sightline raises on purpose. Pure, except `home_path` and
+`install_command`, which read the home folders and the installation.
 """
 
 from enum import StrEnum
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class RejectReason(StrEnum):
-    """A reason for which a robot rejects a message. The names are on the wire (status counters, replies)."""
+    """A reason why a robot rejects a message. The names are on the wire (status counters, replies)."""
 
     MALFORMED = "MALFORMED"  # invalid grammar, size, type or range of a header field
     UNSUPPORTED_VERSION = "UNSUPPORTED_VERSION"  # another version in header field `v`
@@ -41,7 +41,7 @@ CLAMPED = "CLAMPED"
 #  ├─ ConfigError   (2)     a bad option, file, environment variable or scenario
 #  ├─ HardwareError (3)     a device or the simulation is missing or broken
 #  ├─ LinkError     (4)     an endpoint cannot be opened or reached
-#  ├─ CheckError    (5)     an evaluated run did not get so far that it can be scored
+#  ├─ CheckError    (5)     an evaluated run failed before it could be scored
 #  └─ WireError             invalid bytes from a peer; never ends a loop
 
 
@@ -58,7 +58,7 @@ class ConfigError(SightlineError):
 
 
 class HardwareError(SightlineError):
-    """A device, or the simulation in its place, cannot be used."""
+    """A device, or the simulation in its place, is not usable."""
 
     exit_code = 3
 
@@ -91,7 +91,7 @@ class WireError(SightlineError):
 
 def home_path(path: "str | Path") -> "Path":
     """Return `path` with the home folder in place of a first `~` or `~USER`. Raises ConfigError for an unknown user."""
-    from pathlib import Path  # imports delay STOP
+    from pathlib import Path  # here, because imports delay STOP
 
     try:
         return Path(path).expanduser()
@@ -100,11 +100,11 @@ def home_path(path: "str | Path") -> "Path":
 
 
 def install_command(extra: str) -> str:
-    """Return the command that adds an extra to this installation: to a clone, or to the wheel that it came from.
+    """Return the command that adds an extra to this installation, from its clone or its wheel.
 
     Source: PEP 610, `direct_url.json`. The name on the index is not used, because nothing is published there.
     """
-    import json  # only errors need these, and imports delay STOP
+    import json  # here, because only errors need these, and imports delay STOP
     from importlib.metadata import PackageNotFoundError, distribution
     from pathlib import Path
     from urllib.parse import unquote, urlsplit
@@ -117,6 +117,6 @@ def install_command(extra: str) -> str:
     if "vcs_info" in record:
         return f"pip install 'sightline-robot[{extra}] @ {record['vcs_info']['vcs']}+{record['url']}'"
     place = unquote(urlsplit(record["url"]).path) if record else "."
-    # Without the option pip puts a copy in the place of an editable installation.
+    # Without this option pip replaces an editable installation by a copy.
     editable = "--editable " if record.get("dir_info", {}).get("editable") else ""
     return f"pip install {editable}'{'.' if place == str(Path.cwd()) else place}[{extra}]'"

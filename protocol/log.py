@@ -1,10 +1,10 @@
-"""The log of a service: standard `logging` through one handler that never blocks its caller, as text or JSON. Shell.
+"""The log of a service: `logging` with a handler that never blocks its caller, as text or JSON. Shell.
 
     sightline robot                   2026-03-01T10:00:00.123Z info robot r1: on tcp/127.0.0.1:7447
     sightline robot --log json        {"time":"2026-03-01T10:00:00.123Z","level":"info","service":"robot","message":...}
 
-Information goes to the standard output; warnings and errors go to the standard error. The choice of the form is in the
-environment, so that both processes of a robot use the same.
+Information goes to stdout; warnings and errors go to stderr. An environment variable holds the format, so that both
+processes of a robot use the same one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def _time_of(record: logging.LogRecord) -> str:
 
 
 class TextFormatter(logging.Formatter):
-    """Time, level and message."""
+    """Formats a record as time, level and message."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line of `record`, with its traceback if it has one."""
@@ -46,19 +46,19 @@ class TextFormatter(logging.Formatter):
 
 
 def _shown(letter: str) -> str:
-    """Escape what may not reach a terminal: control characters, and what is not text, e.g. of a file's name."""
+    """Escape a control character, or a character that is not text, e.g. from a file name, for a terminal."""
     return letter if letter.isprintable() or letter in "\n\t" else letter.encode("unicode_escape").decode()
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object per record, on one line."""
+    """Formats each record as one JSON object on one line."""
 
     def __init__(self, service: str) -> None:
         super().__init__()
         self._service = service
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the object of `record`; a traceback is part of its message."""
+        """Return the JSON object of `record`; a traceback is part of its message."""
         return json.dumps({
             "time": _time_of(record),
             "level": record.levelname.lower(),
@@ -68,35 +68,35 @@ class JsonFormatter(logging.Formatter):
 
 
 class QueueHandler(logging.Handler):
-    """Writes lines from a thread of its own. A stream that is not read costs lines, never time of the caller."""
+    """Writes lines from a separate thread. A stream without a reader loses lines, but never delays the caller."""
 
     def __init__(self) -> None:
         super().__init__()
         self.forget_thread()
 
     def forget_thread(self) -> None:
-        """Start again without a thread and without lines, as in a fork: the thread is in the other process."""
+        """Reset the handler in a forked process, where the thread does not exist."""
         self._lines: queue.Queue[tuple[str | logging.LogRecord, TextIO | None]] = queue.Queue(_MAX_WAITING_LINES)
         self._is_started = False
         self._starting = threading.Lock()
 
     def start(self) -> None:
-        """Start the thread that writes, if it is not started. Raises RuntimeError where the system permits no more."""
+        """Start the writing thread if it is not started. Raises RuntimeError if the system permits no more threads."""
         with self._starting:
             if not self._is_started:
                 threading.Thread(target=self._write_all, name="log", daemon=True).start()
                 self._is_started = True
 
     def handle(self, record: logging.LogRecord) -> bool:
-        """Emit without the lock of `logging`, so that no caller waits while a line of another thread is formatted."""
+        """Emit without the lock of `logging`, so that no caller waits for the formatting of another thread."""
         passed = bool(self.filter(record))
         if passed:
             self.emit(record)
         return passed
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Queue the line of `record`, or drop it where no more lines may wait. Never raises into its caller."""
-        # A traceback quotes source files. A control loop must not wait for the disk that has them.
+        """Queue the line of `record`, or drop it if the queue is full. Never raises."""
+        # A traceback quotes source files, so the writing thread formats it. A control loop must not wait for the disk.
         line = record if record.exc_info else self._line_of(record)
         with suppress(queue.Full, RuntimeError):
             if not self._is_started:
@@ -106,11 +106,11 @@ class QueueHandler(logging.Handler):
     def _line_of(self, record: logging.LogRecord) -> str:
         try:
             return self.format(record)
-        except Exception:  # arguments that do not fit the message
+        except Exception:  # the arguments do not fit the message
             return f"{record.name}: invalid log call {record.msg!r}"
 
     def flush(self) -> None:
-        """Wait until all lines are written, for a second at most. `logging` calls it when the process ends."""
+        """Wait until all lines are written, for one second at most. `logging` calls it at the end of the process."""
         with self._lines.all_tasks_done:
             self._lines.all_tasks_done.wait_for(lambda: not self._lines.unfinished_tasks, _FLUSH_S)
 
@@ -118,12 +118,12 @@ class QueueHandler(logging.Handler):
         while True:
             line, stream = self._lines.get()
             _write(line if isinstance(line, str) else self._line_of(line), stream)
-            del line  # its traceback holds the values of each frame
+            del line  # its traceback references the variables of each frame
             self._lines.task_done()
 
 
 def _write(line: str, stream: TextIO | None) -> None:
-    """Write `line` in letters that `stream` has, since peers choose some of them."""
+    """Write `line` with unencodable characters escaped, because peers choose some of them."""
     if stream is None:
         return
     try:
@@ -131,17 +131,17 @@ def _write(line: str, stream: TextIO | None) -> None:
         print(line.encode(encoding, "backslashreplace").decode(encoding) if encoding else line, file=stream, flush=True)
     except OSError as error:
         _discard(stream, has_reader=error.errno not in (errno.EPIPE, errno.EIO))
-    except Exception:  # whatever a line does to a stream, the next one may be shown
+    except Exception:  # an error with one line must not stop the next lines
         return
 
 
 def _discard(stream: TextIO, *, has_reader: bool) -> None:
-    """Discard what is buffered, which would spoil the exit. Without a reader, discard all that follows, too."""
+    """Discard the buffer, which would cause an error at exit. Without a reader, discard all later lines, too."""
     with suppress(Exception), open(os.devnull, "wb") as nowhere:  # noqa: PTH123  the guardian has no pathlib
         number = stream.fileno()
         before = os.dup(number)
         os.dup2(nowhere.fileno(), number)
-        if has_reader:  # a full disk, or a pipe without room at present
+        if has_reader:  # the disk is full, or the pipe has no room now
             stream.flush()
             os.dup2(before, number)
         os.close(before)
@@ -153,15 +153,15 @@ os.register_at_fork(after_in_child=_HANDLER.forget_thread)
 
 
 def start_log_thread() -> None:
-    """Start the thread that writes the log now: a control loop must not wait for it at its first line."""
+    """Start the writing thread now, because a control loop must not wait for it at its first line."""
     with suppress(RuntimeError):
         _HANDLER.start()
 
 
 def start_log(form: str | None, service: str) -> None:
-    """Log in `form` from now on, here and in processes started from here; None: as the environment has it.
+    """Log in the format `form` from now on, also in child processes. None: the format of the environment.
 
-    Raises ConfigError for an unknown form.
+    Raises ConfigError for an unknown format.
     """
     chosen = form or os.environ.get(LOG_FORMAT_VARIABLE) or LOG_FORMATS[0]
     if chosen not in LOG_FORMATS:
@@ -171,14 +171,14 @@ def start_log(form: str | None, service: str) -> None:
         os.environ[LOG_FORMAT_VARIABLE] = form
     _HANDLER.setFormatter(JsonFormatter(service) if chosen == "json" else TextFormatter())
     logging.getLogger("sightline").setLevel(logging.INFO)
-    logging.getLogger().addHandler(_HANDLER)  # of the root: third-party libraries and plug-ins log the same way
+    logging.getLogger().addHandler(_HANDLER)  # the root logger: third-party libraries and plug-ins use it, too
     logging.captureWarnings(True)
     threading.excepthook = _log_thread_error
     logging.getLogger("zenoh.handlers").addFilter(_is_no_fault)
 
 
 def _is_no_fault(record: logging.LogRecord) -> bool:
-    """Report the exception of a callback that Zenoh logs each time. Returns False to drop the line of Zenoh."""
+    """Report the callback exceptions that Zenoh logs. Returns False to drop Zenoh's own line."""
     error = record.exc_info[1] if record.exc_info else None
     if error is not None:
         report_fault("callback", error)
@@ -207,7 +207,7 @@ def report_fault(part: str, error: BaseException, name: str = "") -> str:
     Args:
         part: where it was raised, e.g. `camera`; `status` shows the counts by part.
         error: the exception. Its kind is its class and the line that raised it.
-        name: which one, e.g. the name of the thread.
+        name: further name of the place, e.g. of the thread.
 
     Returns:
         The text of the exception, see `error_text`.
@@ -227,13 +227,13 @@ def report_fault(part: str, error: BaseException, name: str = "") -> str:
 
 
 def report_ending(part: str, error: BaseException) -> None:
-    """Report an exception that ends the program, if it has a log. A command only prints its last line."""
+    """Report an exception that ends a program with a log. A command without a log only prints its last line."""
     if logging.getLogger().handlers:
         report_fault(part, error)
 
 
 def error_text(error: BaseException) -> str:
-    """Return the message of an exception, or its class, in printable letters on one line, whatever its `str` does."""
+    """Return the message of an exception, or its class, as one printable line, even if its `str` fails."""
     try:
         text = " ".join(str(error).split())
     except Exception:
@@ -242,9 +242,9 @@ def error_text(error: BaseException) -> str:
 
 
 def fault_text(part: str, error: BaseException) -> str:
-    """Return the text of an exception for `status`: place and class too, unless it is one of Sightline's own.
+    """Return the text of an exception for `status`, with place and class unless it is a SightlineError.
 
-    A SightlineError states the fix. Another exception comes from a mistake in the code of a plug-in.
+    A SightlineError contains the fix. Any other exception is an error in the code of a plug-in.
 
     Args:
         part: where it was raised, e.g. `camera`.
@@ -257,18 +257,18 @@ def fault_text(part: str, error: BaseException) -> str:
 
 
 def printable(text: str) -> str:
-    """Return `text` with `?` for each letter that a terminal or a message may not get."""
+    """Return `text` with `?` for each unprintable character."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def faults() -> Counter[str]:
-    """Return how often each part of this process raised an exception since the start."""
+    """Return the number of exceptions in each part of this process since the start."""
     with _counting:
         return Counter(_faults)
 
 
 def error_line(text: str) -> str:
-    """Return the last line of a program that ends with an error, in the form of its log."""
+    """Return the last line of a program that ends with an error, in the format of its log."""
     record = logging.makeLogRecord({"msg": text, "levelno": logging.ERROR, "levelname": "ERROR"})
     return _HANDLER.format(record) if isinstance(_HANDLER.formatter, JsonFormatter) else (
         "error: " + "\n".join(map(printable, text.split("\n"))))
@@ -277,29 +277,29 @@ def error_line(text: str) -> str:
 _FIRST_PERIOD_US: Final = 1_000_000
 _LONGEST_PERIOD_US: Final = 60_000_000
 _FORGOTTEN_US: Final = 10_000_000
-"""A key that did not come for so long is news again."""
+"""Time after which a key counts as new again."""
 _MAX_KEYS: Final = 16
 _OTHERS: Final = ""
 
 
-class _Repeat:  # the guardian has no memory for `dataclasses`
+class _Repeat:  # not a dataclass, because the guardian should not load `dataclasses`
     def __init__(self, seen_us: int) -> None:
         self.seen_us = seen_us
         self.count = self.logged_us = self.period_us = 0
 
 
 class RepeatLimiter:
-    """Permits a line per key at once, then after 1, 2, 4 ... 60 s while it repeats. Beyond 16 keys the rest share one.
+    """Permits the first line of a key, and repeated ones after 1, 2, 4 ... 60 s. Keys beyond 16 share one limit.
 
-    Peers choose some of the keys, so neither their memory nor their lines may grow without bound.
+    Peers choose some of the keys, so memory and lines must have limits.
     """
 
     def __init__(self) -> None:
         self._repeats: dict[str, _Repeat] = {}
-        """The key that was seen last is the last."""
+        """Ordered by the last use of a key, the newest last."""
 
     def due(self, key: str, now_us: int, times: int = 1) -> int:
-        """Count `key` `times` more. Return how often it came since its last line if a line is due, else 0."""
+        """Count `times` events of `key`. Return the number since its last line if a line is due, else 0."""
         key = self._bounded(key, now_us)
         repeat = self._repeats.pop(key, _Repeat(seen_us=now_us - _FORGOTTEN_US))
         self._repeats[key] = repeat

@@ -67,7 +67,7 @@ class Stamp(WireModel):
 
 
 class FrameHeader(Stamp):
-    """Header of a frame. `t_us` is the capture time. All other fields describe the robot at that moment."""
+    """Header of a frame. `t_us` is the capture time. All other fields describe the robot at that time."""
 
     pose: Pose = Field(default=(0.0, 0.0, 0.0), description="odometry: x, y, yaw")
     moving: Planar = Field(default=(0.0, 0.0), description="measured at the wheels: linear, angular")
@@ -125,7 +125,7 @@ class SenderHeader(WireModel):
 
     @property
     def digest(self) -> str:
-        """Return what others are shown of the sender in place of its session."""
+        """Return the public name of the sender, in place of its session."""
         return session_digest(self.source, self.session)
 
 
@@ -228,7 +228,7 @@ class LeaseHolder(WireModel):
 
     @classmethod
     def of(cls, source: str, session: str) -> Self:
-        """Show the driver that has this session."""
+        """Create it for the driver with this session."""
         return cls(source=source, digest=session_digest(source, session))
 
 

@@ -1,7 +1,7 @@
-"""Prove that commands are of one sender: each reveals one more element of a hash chain. Pure.
+"""Prove that commands come from one sender: each command reveals one more element of a hash chain. Pure.
 
-An element is the hash of the one that follows it. Only the sender knows the elements that it has not revealed, so
-nothing secret crosses the network. A receiver hashes a new element until it meets the last one that it accepted.
+An element is the hash of the next one. Only the sender knows the elements that are not revealed yet, so no secret
+crosses the network. A receiver hashes a new element until the result is the last accepted one.
 """
 
 from collections.abc import Callable, Iterator
@@ -11,14 +11,14 @@ from typing import Final, NamedTuple
 ELEMENT_BYTES: Final = 16
 """Security level: 128 bits."""
 MAX_LOST: Final = 64
-"""Security limit: hashes for one command. So many commands may be lost in a row, more than in the life of a lease."""
+"""Security limit: hashes for one command. So many commands in a row may be lost, more than in the life of a lease."""
 _LENGTH: Final = 1024
 _ANNOUNCED: Final = 2 * MAX_LOST
-"""The next chain is announced in so many commands, so that the robot receives one of them."""
+"""Number of commands that announce the next chain, so that the robot receives at least one of them."""
 
 
 class Proof(NamedTuple):
-    """Fields of a command's header."""
+    """The proof fields in the header of a command."""
 
     proof: str | None
     next_proof: str | None = None
@@ -28,7 +28,7 @@ NO_PROOF: Final = Proof(None)
 
 
 class ProofChain:
-    """The chain of one sender. It continues in another chain before it ends.
+    """The hash chain of one sender. Before its end it continues with a new chain.
 
     Args:
         draw: returns ELEMENT_BYTES random bytes.
@@ -38,7 +38,7 @@ class ProofChain:
         self._draw = draw
         self._elements = self._new()
         self.token: Final = _token(self._elements[-1])
-        """What the token of this driver contains. Before the first proof only this sender can compute it."""
+        """The value in the token of this driver. Before the first proof only this sender can compute it."""
         self._following: list[bytes] = []
         self._announced: str | None = None
 
@@ -49,7 +49,7 @@ class ProofChain:
         proof = self._elements.pop().hex()
         if self._announced is None and len(self._elements) < _ANNOUNCED:
             self._following = self._new()
-            # The announced element is known from now on, so it proves nothing.
+            # The announced element is public from now on, so it is not a proof.
             self._announced = self._following.pop().hex()
         return Proof(proof, self._announced)
 
@@ -61,7 +61,7 @@ class ProofChain:
 
 
 def continues(proof: str | None, last: Proof) -> bool:
-    """Return True if `proof` was revealed by the sender of `last`, at most MAX_LOST commands later."""
+    """Return True if the sender of `last` revealed `proof`, at most MAX_LOST commands later."""
     if proof is None or last.proof is None:
         return False
     known = {bytes.fromhex(one) for one in last if one is not None}
@@ -74,7 +74,7 @@ def continues(proof: str | None, last: Proof) -> bool:
 
 
 def tokens_of(proof: str | None) -> Iterator[str]:
-    """Yield the tokens of a driver whose `proof` is one of its first MAX_LOST."""
+    """Yield the possible tokens of a driver whose `proof` is one of its first MAX_LOST."""
     if proof is None:
         return
     element = bytes.fromhex(proof)
@@ -84,7 +84,7 @@ def tokens_of(proof: str | None) -> Iterator[str]:
 
 
 def _token(element: bytes) -> str:
-    # A hash of its own kind: else the hash of one token would be another token of the same driver.
+    # A separate hash function, because otherwise the hash of one token would be another token of the same driver.
     return sha256(b"sightline-token/" + element).digest()[:ELEMENT_BYTES].hex()
 
 
@@ -93,5 +93,5 @@ def _hashed(element: bytes) -> bytes:
 
 
 def session_digest(source: str, session: str) -> str:
-    """Return what a robot shows of a driver's session: 8 hex digits that the driver can compute too."""
+    """Return the public name of a driver's session: 8 hex digits, which the driver can compute, too."""
     return sha256(f"{source}/{session}".encode()).hexdigest()[:8]

@@ -15,11 +15,11 @@ _OLDER: Final = {
     "twist": ("receive", MAX_TWIST_BYTES, "linear|angular in m/s and rad/s, as a guest"),
     "boxes": ("receive", MAX_BOXES_BYTES, "y_min,x_min,y_max,x_max in fractions of the image, joined by -"),
 }
-"""Texts of the legacy protocol: the sender, the most bytes, the meaning."""
+"""Texts of the legacy protocol: direction, maximum size in bytes, meaning."""
 
 
 def document(definitions: Node) -> Node:
-    """The whole document; `definitions` are the JSON Schemas of all models by name."""
+    """Return the whole document. `definitions` are the JSON Schemas of all models by name."""
     older = {f"older_{name}": _text(most, purpose) for name, (_, most, purpose) in _OLDER.items()}
     return {
         "asyncapi": "3.0.0",
@@ -151,7 +151,7 @@ def _references(path: str, *names: str) -> list[Node]:
 
 
 def _draft_07(schema: Any) -> Any:
-    """`schema` in the JSON Schema that AsyncAPI speaks by itself: tuples and references are written otherwise."""
+    """Convert `schema` to draft 07 of JSON Schema, which AsyncAPI uses: tuples and references differ."""
     if isinstance(schema, list):
         return [_draft_07(one) for one in schema]
     if not isinstance(schema, dict):

@@ -2,12 +2,12 @@
 
 Each folder of cases has one kind of input, `given`, and one kind of result:
 
-    websocket      a binary message from a peer with `robot` and `role` in its hello: key, header, payload
-    hello          the text of a hello: its fields
-    older_picture  base64 text, at most `max_bytes` of image: the bytes of the JPEG
-    older_dashed   `linear-angular`: the twist
-    older_boxes    boxes joined by `-`
-    stop           a datagram of the STOP port and the STOP secret, empty without keys: its fields
+    websocket      a binary message from a peer with `robot` and `role` in its hello -> key, header, payload
+    hello          the text of a hello -> its fields
+    older_picture  base64 text, at most `max_bytes` of image -> the bytes of the JPEG
+    older_dashed   `linear-angular` -> the twist
+    older_boxes    boxes joined by `-` -> the boxes
+    stop           a datagram of the STOP port and the STOP secret, empty without keys -> its fields
 """
 
 import dataclasses
@@ -118,7 +118,7 @@ HELLO: Fields = {"v": 1, "robot": "r1", "role": "vision", "session": PEER, "want
 
 
 def framed(block: bytes, payload: bytes = b"0.2000|-0.3500", size: int | None = None) -> bytes:
-    """One binary message; `size` for a length that lies."""
+    """Return one binary message. `size` replaces the length by a false one."""
     return struct.pack(">H", len(block) if size is None else size) + block + payload
 
 
@@ -308,4 +308,4 @@ FRAMING_CASES: tuple[FramingCase, ...] = (
     *_texts("older_boxes", _BOXES_GOOD, _BOXES_MALFORMED),
     *_datagrams(),
 )
-"""Every case; what is made of what is not a message by itself but carries messages."""
+"""Every case of framing, hellos, texts and datagrams."""

@@ -1,6 +1,6 @@
 """Writes or verifies the generated parts of the specification. Shell.
 
-    python -m sightline.protocol.spec.generate --verify    exit code 5 and the names of what differs, if anything does
+    python -m sightline.protocol.spec.generate --verify    exit code 5 and the names of files that differ
     python -m sightline.protocol.spec.generate --write
 """
 
@@ -45,17 +45,17 @@ _UNITS: Final = {
     "moving": "m/s, rad/s",
     "applied": "m/s, rad/s",
 }
-"""Ending of a field's name -> its unit; the first that fits."""
+"""Ending of a field name -> its unit. The first match counts."""
 Schema = dict[str, Any]
 
 
 def unit_of(field: str) -> str:
-    """The unit of `field`; "" for a number without one and for text."""
+    """Return the unit of `field`; "" for a number without a unit and for text."""
     return next((unit for ending, unit in _UNITS.items() if field.endswith(ending)), "")
 
 
 def channel_table() -> str:
-    """The channels as Markdown tables: what they are, and how they are carried."""
+    """Return the channels as two Markdown tables: their meaning, and their transport."""
     rows = ["| channel | direction | key | header | payload | what it is |", "|---" * 6 + "|"]
     carried = ["| channel | payload bytes | encoding | priority | rate | when a link is full |", "|---" * 6 + "|"]
     for one in CHANNELS.values():
@@ -73,7 +73,7 @@ def channel_table() -> str:
 
 
 def reject_reason_table() -> str:
-    """Every reason for not obeying and what it means, as a Markdown table."""
+    """Return every reject reason and its meaning, as a Markdown table."""
     rows = ["| reason | meaning |", "|---|---|"]
     meanings = dict(re.findall(r'"(\w+)"  # (.*)', inspect.getsource(rejections)))
     rows += [f"| `{reason}` | {meanings[reason]} |" for reason in RejectReason]
@@ -82,7 +82,7 @@ def reject_reason_table() -> str:
 
 
 def field_tables() -> str:
-    """One Markdown table per model, headers first."""
+    """Return one Markdown table per model, headers first."""
     return "\n".join(_model_table(name, schema) for name, schema in _definitions().items())
 
 
@@ -93,7 +93,7 @@ def _models() -> list[type[BaseModel]]:
 
 
 def json_schema() -> Schema:
-    """JSON Schema of every header, JSON payload and the WebSocket hello, under `$defs`."""
+    """Return the JSON Schema of every header, JSON payload and the WebSocket hello, under `$defs`."""
     return models_json_schema([(model, "validation") for model in _models()], title="Sightline wire protocol 1")[1]
 
 
@@ -125,7 +125,7 @@ def _first_line(schema: Schema) -> str:
 
 
 def _type_of(schema: Schema) -> str:
-    """A JSON Schema in a few words."""
+    """Describe the type of a JSON Schema in a few words."""
     if "$ref" in schema:
         return _named(schema["$ref"].rpartition("/")[2])
     if "anyOf" in schema:
@@ -182,12 +182,12 @@ GENERATED: Final = {
 
 
 def readme(text: str) -> str:
-    """Return `text` with every generated block filled in again."""
+    """Return `text` with every generated block updated."""
     return _BLOCK.sub(lambda block: block[1] + GENERATED[block[2]]() + block[3], text)
 
 
 def expected_files() -> dict[Path, str]:
-    """Every generated file, relative to this package, and what it must hold."""
+    """Return every generated file, relative to this package, with its expected content."""
     files = {Path("README.md"): readme((HERE / "README.md").read_text("utf-8"))}
     schema = json_schema()
     files[Path("schema.json")] = json.dumps(schema, indent=1) + "\n"
@@ -196,7 +196,7 @@ def expected_files() -> dict[Path, str]:
 
 
 def differing() -> list[Path]:
-    """Generated files that are missing, left over, or not as the code would write them."""
+    """Return the generated files that are missing, not expected, or different."""
     expected = expected_files()
     there = {path.relative_to(HERE) for path in (HERE / "vectors").rglob("*.json")}
     wrong = [path for path, text in expected.items() if _read(HERE / path) != text]
@@ -208,7 +208,7 @@ def _read(path: Path) -> str | None:
 
 
 def write() -> None:
-    """Bring every generated file up to date and remove vectors that no case stands for."""
+    """Write every generated file, and remove vectors without a case."""
     expected = expected_files()
     for path in differing():
         if path not in expected:
@@ -219,7 +219,7 @@ def write() -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Command line; returns the exit code: 0, or 5 if `--verify` found a difference."""
+    """Run the command line. Returns the exit code: 0, or 5 if `--verify` found a difference."""
     parser = argparse.ArgumentParser(
         prog="python -m sightline.protocol.spec.generate", description=__doc__.partition("\n")[0]
     )

@@ -1,13 +1,13 @@
 """Builds the golden vectors and checks that the decoders agree with each of them. Pure.
 
-`message_cases.py` and `framing_cases.py` state each case and its outcome by hand; a file is made only if the decoders
-agree. A message lies in `vectors/<channel>/<case>.json`:
+`message_cases.py` and `framing_cases.py` define each case and its result by hand. A file is written only if the
+decoders agree. A message is in `vectors/<channel>/<case>.json`:
 
     `{"purpose", "key", "header_hex", "payload_hex", "accept": {"source", "header", "payload"} or "refuse": reason}`
 
-`header` and `payload` are as read, with defaults filled in; `null` is a header that may be missing. A picture's payload
-is its size, a scan's the ranges with "inf" for no return. What carries messages lies beside them, in folders that
-`framing_cases.py` lists: fields to read instead of key, header and payload, and what they give.
+`header` and `payload` are decoded, with defaults filled in; `null` is an absent optional header. The payload of an
+image is its size, of a scan the ranges, with "inf" for no return. Cases of `framing_cases.py` are in separate folders.
+They have their own input fields in place of key, header and payload, and their results.
 """
 
 import json
@@ -24,7 +24,7 @@ from sightline.protocol.spec.message_cases import CASES, MessageCase
 from sightline.protocol.text import parse_twist
 
 INEXACT_KEY = "INEXACT_KEY"
-"""The outcome of a key that is not exact. The receiver counts it and sends no reply."""
+"""Result for a key that is not exact. The receiver counts it and sends no reply."""
 Outcome = dict[str, Any]
 
 
@@ -64,7 +64,7 @@ def _read_payload(channel: Channel, payload: bytes) -> Any:
 
 
 def vector(case: MessageCase) -> Outcome:
-    """The case as it is written to its file. Raises ValueError if the decoders do not do what the case states."""
+    """Return the content of the case's file. Raises ValueError if the decoders disagree with the case."""
     got = outcome(case.key, case.header, case.payload)
     if got.get("refuse") != case.refuse:
         raise ValueError(f"{case.channel}/{case.name}: stated {case.refuse or 'accept'}, decoded to {got}")
@@ -85,7 +85,7 @@ def _wire_vector(case: FramingCase) -> Outcome:
 
 
 def files() -> dict[Path, str]:
-    """Every vector file below `vectors/` and its text."""
+    """Return every vector file below `vectors/` and its text."""
     vectors = {Path(case.channel, case.name): vector(case) for case in CASES}
     vectors |= {Path(case.folder, case.name): _wire_vector(case) for case in FRAMING_CASES}
     return {Path(f"{path}.json"): _text(contents) + "\n" for path, contents in vectors.items()}
@@ -107,7 +107,7 @@ def vector_table() -> str:
 
 
 def examples() -> str:
-    """The first vector of each channel, for the specification."""
+    """Return the first vector of each channel, for the specification."""
     first = {case.channel: case for case in reversed(CASES)}
     blocks = [
         f"`vectors/{case.channel}/{case.name}.json`, {case.purpose}:\n\n```json\n"

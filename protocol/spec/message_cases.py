@@ -10,7 +10,7 @@ from sightline.protocol.channels import CHANNELS, key_for
 
 @dataclass(frozen=True, slots=True)
 class MessageCase:
-    """One message and what must become of it; `refuse` is None where it is accepted."""
+    """One message and its required result; `refuse` is None for an accepted message."""
 
     channel: str
     name: str
@@ -43,28 +43,28 @@ TARGET: dict[str, Any] = {"label": "ball", "score": 0.93, "track": 4, "bearing_r
 
 
 def packed(value: dict[str, Any]) -> bytes:
-    """JSON without blanks."""
+    """Encode as JSON without spaces."""
     return json.dumps(value, separators=(",", ":")).encode()
 
 
 def without(value: dict[str, Any], *names: str) -> dict[str, Any]:
-    """`value` less some fields."""
+    """Return `value` without some fields."""
     return {name: item for name, item in value.items() if name not in names}
 
 
 def echoing(echo: dict[str, Any]) -> dict[str, Any]:
-    """The usual answer with another echo."""
+    """Return the usual answer with another echo."""
     return ANSWER | {"echo": echo}
 
 
 def jpeg(width_px: int, height_px: int, marker: int = 0xC0, components: int = 3, bits: int = 8) -> bytes:
-    """The start of a JPEG up to its frame header; enough for a bounds check, no picture."""
+    """Return the start of a JPEG up to its frame header, which is sufficient for a size check."""
     body = struct.pack(">BHHB", bits, height_px, width_px, components) + b"\x01\x11\x00" * components
     return b"\xff\xd8" + b"\xff" + bytes([marker]) + struct.pack(">H", len(body) + 2) + body
 
 
 def segments(count: int) -> bytes:
-    """A JPEG with `count` empty comments before its frame header."""
+    """Return a JPEG with `count` empty comments before its frame header."""
     return b"\xff\xd8" + b"\xff\xfe\x00\x02" * count + jpeg(320, 240)[2:]
 
 
@@ -78,7 +78,7 @@ def case(
     payload: dict[str, Any] | bytes | None = None,
     key: str = "",
 ) -> MessageCase:
-    """A case that differs from the channel's valid message only in what is given."""
+    """Create a case from the valid message of the channel, with the given changes."""
     source, usual_header, usual_payload = USUAL[channel]
     head = usual_header if header is None else header
     body = usual_payload if payload is None else payload
@@ -111,7 +111,7 @@ USUAL: dict[str, tuple[str, dict[str, Any], dict[str, Any] | bytes]] = {
 }
 
 
-# Golden cases of frames: headers and pictures. Pure.
+# Golden cases of frames: headers and images. Pure.
 
 
 def frames() -> list[MessageCase]:
@@ -162,7 +162,7 @@ def pictures() -> list[MessageCase]:
 
 
 def views() -> list[MessageCase]:
-    """Pictures that vision made for people."""
+    """Return cases of images that the vision service creates for viewers."""
     return [
         case("overlay", "without_echo", "for showing only", header=without(ANSWER, "echo")),
         case("overlay", "no_role", "a key without its role", INEXACT, key="sightline/r1/overlay"),
@@ -256,7 +256,7 @@ def answers() -> list[MessageCase]:
     ]
 
 
-# Golden cases of everything whose payload is JSON or floats. Pure.
+# Golden cases of all channels with a JSON or float payload. Pure.
 
 
 def payloads() -> list[MessageCase]:
@@ -294,7 +294,7 @@ def payloads() -> list[MessageCase]:
 
 
 def _found(*boxes: dict[str, Any]) -> dict[str, Any]:
-    """The usual picture with these boxes."""
+    """Return the usual detections with these boxes."""
     return DETECTIONS | {"boxes": list(boxes)}
 
 
@@ -390,7 +390,7 @@ def reports() -> list[MessageCase]:
     ]
 
 
-# The golden cases, stated by hand: key, header, payload, and the rejection, if any. Pure.
+# The golden cases, defined by hand: key, header, payload, and the rejection, if any. Pure.
 
 
 def _usual() -> list[MessageCase]:

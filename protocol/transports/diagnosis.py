@@ -1,4 +1,4 @@
-"""Reads who uses a TCP port from the system's table, and finds what is wrong with a TLS link. Shell."""
+"""Find the process that uses a TCP port, and the cause of a failed TLS link. Shell."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sightline.protocol.transports.endpoints import OVER_UDP, parse_websocket_en
 from sightline.protocol.transports.security import RoleKeys, date_problem
 
 if TYPE_CHECKING:
-    import ssl  # takes 4 MB, so functions import it when something is wrong
+    import ssl  # takes 4 MB, so functions import it only after an error
 
 # Linux's lists of TCP sockets.
 TABLES: Final = Path("/proc/net")
@@ -40,23 +40,23 @@ def port_owner(port: int) -> str:
 
 
 def port_in_use(endpoint: str, port: int) -> LinkError:
-    """Return the error of an endpoint whose port another process has."""
+    """Return the error of an endpoint whose port is in use by another process."""
     owner = port_owner(port) or "another process"
     return LinkError(f"cannot listen on {endpoint}: port {port} is in use by {owner}; end it or choose another port")
 
 
 def check_ports(endpoints: Iterable[str]) -> None:
-    """Raise LinkError if another process has the TCP port of an endpoint. Other trouble shows when it is opened."""
+    """Raise LinkError if another process uses the TCP port of an endpoint. Other errors appear when it is opened."""
     for endpoint in endpoints:
         is_websocket = "://" in endpoint
         if is_websocket:
             _, host, port, *_ = parse_websocket_endpoint(endpoint)
         else:
             transport, host, port = parse_zenoh_endpoint(endpoint)
-            if transport in OVER_UDP or "iface=" in endpoint:  # two interfaces may have one port
+            if transport in OVER_UDP or "iface=" in endpoint:  # two interfaces may use one port
                 continue
         try:
-            address = ipaddress.ip_address(host)  # a name may take seconds
+            address = ipaddress.ip_address(host)  # names are skipped, because they may take seconds
             with socket.socket(socket.AF_INET6 if address.version == 6 else socket.AF_INET) as tried:
                 tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 if address.version == 6 and is_websocket:
@@ -84,7 +84,7 @@ def process_with_open(files: Collection[str], besides: int = 0) -> str:
 
 
 def unresolved_host(hosts: Iterable[str]) -> str:
-    """Return the first of `hosts` that has no address, "" if all have one; a name server may take seconds."""
+    """Return the first of `hosts` without an address, or "" if all have one. A name server may take seconds."""
     for host in hosts:
         try:
             socket.getaddrinfo(host, None)
@@ -102,26 +102,26 @@ def connection_ends(ports: Collection[int], tables: Sequence[str] = _TCP) -> dic
 
     Args:
         ports: local ports.
-        tables: `TCP_IPV4` if only IPv4 sockets listen on them. To read a table takes several ms, also an empty one.
+        tables: `TCP_IPV4` if only IPv4 sockets listen on them. Reading a table takes several ms, even if it is empty.
 
     Returns:
-        Both ends of each connection, as in the table, and its remote host, which is `OWN_HOST` for this machine at
-        any address of its own.
+        Both ends of each connection, as in the table, and its remote host: `OWN_HOST` for any address of this
+        machine.
     """
     # The kernel writes the table in pieces, so a row can come twice while other sockets open and close.
     return {(row[1], row[2]): _remote_host(row) for row in _rows(ports, tables) if row[3] != _LISTEN}
 
 
 _OPENED: Final = {"snmp": "PassiveOpens", "netstat": "TCPDeferAcceptDrop"}
-"""Counters of the connections that were opened to this machine, and of those that it holds back until their first
+"""Counters of connections that were opened to this machine, and of connections that it holds back until their first
 byte."""
 
 
 def opened_connections() -> int | None:
-    """Count what was opened to this machine so far, or return None if the system does not show it.
+    """Return the number of connections opened to this machine so far, or None if the system does not show it.
 
-    Only a change of the count is of use: one that is held back counts twice. To read it takes a thirtieth of the time
-    that the table of sockets takes.
+    Use only changes of the count, because a connection that is held back counts twice. Reading it takes a thirtieth of
+    the time of the socket table.
     """
     total = 0
     with suppress(OSError, ValueError, KeyError):
@@ -134,22 +134,22 @@ def opened_connections() -> int | None:
 
 
 def own_sockets(wanted: Callable[[str], bool] = lambda name: name.startswith("socket:")) -> Iterator[socket.socket]:
-    """Yield the sockets of this process, also those that a library opened, each to be used before the next.
+    """Yield the sockets of this process, also those of libraries. Use each one before the next.
 
     Args:
-        wanted: returns True for the target of an entry in `/proc/self/fd`. By default all sockets.
+        wanted: returns True for the target of an entry in `/proc/self/fd`. The default selects all sockets.
     """
     try:
         links = list(Path("/proc/self/fd").iterdir())
-    except OSError:  # another system
+    except OSError:  # not on Linux
         return
     for link in links:
-        with suppress(OSError):  # closed meanwhile
+        with suppress(OSError):  # closed in the meantime
             if wanted(str(link.readlink())):
                 number = os.dup(int(link.name))
                 try:
                     one = socket.socket(fileno=number)
-                except OSError:  # no socket any more
+                except OSError:  # not a socket any longer
                     os.close(number)
                     continue
                 with one:
@@ -162,10 +162,10 @@ def listening_inodes(ports: Collection[int]) -> set[str]:
 
 
 def _rows(ports: Collection[int], tables: Sequence[str] = _TCP) -> Iterator[list[str]]:
-    """Yield the rows of the tables whose local port is one of `ports`. Other rows of a long table cost no memory."""
+    """Yield the rows of the tables whose local port is one of `ports`, without storing the other rows."""
     endings = tuple(f":{port:04X}" for port in ports)
     for name in tables:
-        with suppress(OSError), (TABLES / name).open(encoding="ascii") as table:  # another system, or no IPv6
+        with suppress(OSError), (TABLES / name).open(encoding="ascii") as table:  # not on Linux, or no IPv6
             for line in table:
                 if line.split(None, 2)[1].endswith(endings):
                     yield line.split()
@@ -178,7 +178,7 @@ def _remote_host(row: Sequence[str]) -> str:
 
 def _host(address: str) -> str:
     """Convert an address of the table to text."""
-    # The table has each 32 bits in the byte order of the machine, in hex digits.
+    # Each 32 bits are hex digits in the byte order of the machine.
     digits = address.rpartition(":")[0]
     words = [bytes.fromhex(digits[start:start + 8])[::-1] for start in range(0, len(digits), 8)]
     host = ipaddress.ip_address(b"".join(words))
@@ -186,7 +186,7 @@ def _host(address: str) -> str:
 
 
 def _descriptors(process: Path) -> list[Path]:
-    """Return the open files of a process, or none if it is gone or belongs to another user."""
+    """Return the open files of a process, or [] if it is gone or belongs to another user."""
     try:
         return list((process / "fd").iterdir())
     except OSError:
@@ -196,7 +196,7 @@ def _descriptors(process: Path) -> list[Path]:
 def _target(descriptor: Path) -> str:
     try:
         return str(descriptor.readlink())
-    except OSError:  # closed meanwhile
+    except OSError:  # closed in the meantime
         return ""
 
 
@@ -216,7 +216,7 @@ _SILENT = ("it does not answer TLS; it is a plain link (pass --secure there too,
            "it (see its log)")
 _EXPIRED = "its certificate has expired; make new keys there, or set the clock of this machine"
 _NOT_YET = "its certificate is not valid yet; set the clock of this machine"
-# Zenoh sends one alert for both.
+# Zenoh sends the same alert for both.
 _CLOCK_THERE = ("the certificate of this end is valid here, but expired or not valid yet on the clock there; set the "
                 "clock there")
 _OF_CLOCKS = (_EXPIRED, _NOT_YET, _CLOCK_THERE)
@@ -250,13 +250,13 @@ def diagnose_tls(endpoint: str, secured: RoleKeys | None) -> str:
         return str(error)
     if cause not in _OF_CLOCKS:
         return cause
-    # The own files come first: a clock that is wrong here makes the files of both ends look wrong.
+    # First the own files, because a wrong clock here makes the files of both ends look invalid.
     return (date_problem(secured.folder, secured.role, datetime.timedelta(0))
             or f"{cause} (here it is {datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M} UTC)")
 
 
 def keys_problem(secured: RoleKeys) -> str:
-    """Return what is wrong with the files of this end, or "" if they can be read and belong together."""
+    """Return the error in the files of this end, or "" if they are readable and belong together."""
     try:
         _tls_context(secured)
     except LinkError as error:
@@ -276,7 +276,7 @@ def _tls_context(secured: RoleKeys) -> ssl.SSLContext:
         context.load_cert_chain(f"{folder}/{role}.pem", f"{folder}/{role}.key")
     except PermissionError:
         raise LinkError(f"this account may not read ca.pem, {role}.pem and {role}.key in {folder}") from None
-    except OSError:  # also those of ssl
+    except OSError:  # also ssl.SSLError
         raise LinkError(f"{named} in {folder}; copy the files of {role} again from where they were made") from None
     return context
 
@@ -297,7 +297,7 @@ def _speaks_tls(host: str, port: int) -> bool:
 
 
 def _try_handshake(host: str, port: int, context: ssl.SSLContext) -> str:
-    """Run a handshake as Zenoh does, and wait briefly for the reply of the other end to our certificate."""
+    """Run a handshake as Zenoh does, and wait briefly for the other end's reply to this certificate."""
     import ssl
 
     try:

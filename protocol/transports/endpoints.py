@@ -11,13 +11,13 @@ from sightline.protocol.errors import ConfigError
 # Endpoint of a robot and its peers when none is configured.
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 
-# A bounded socket buffer keeps frames young, because data in the socket can no longer be dropped. It holds the data
-# in flight over 200 ms. With a quarter of it, images over such a link had 16 kB instead of 34, and an age of 351 ms
-# at p95 instead of 219 (`bench network --only rtt200`).
+# A bounded socket buffer keeps frames young, because data in the socket can no longer be dropped. It holds the data in
+# flight over 200 ms. A quarter of it gave images of 16 kB instead of 34 on such a link, and an age of 351 ms at p95
+# instead of 219 (`bench network --only rtt200`).
 SEND_BUFFER_BYTES: Final = 262_144
 
 ROBOT_ID: Final = re.compile(NAME_PATTERN)
-_IPV6 = r"\[[0-9A-Fa-f:.]+(?:%[0-9A-Za-z_.-]+)?\]"  # after the %, the interface of a link-local address
+_IPV6 = r"\[[0-9A-Fa-f:.]+(?:%[0-9A-Za-z_.-]+)?\]"  # after the %: the interface of a link-local address
 _ZENOH_ENDPOINT = re.compile(
     rf"(tcp|tls|quic|udp|ws)/({_IPV6}|[^\s:/?#\[\]]+):([0-9]{{1,5}})(\?[^#\s]*)?(#\S*)?"
 )
@@ -69,8 +69,8 @@ def parse_zenoh_endpoint(endpoint: str) -> tuple[str, str, int]:
 
 
 def _is_host(name: str) -> bool:
-    """Return False for a name that Python hands to no resolver: an empty label, or one of 64 characters or more."""
-    if name.isascii():  # as the codec, whose tables take a megabyte of the locked memory of a robot
+    """Return False for a name that Python passes to no resolver: an empty label, or one of 64 characters or more."""
+    if name.isascii():  # as the idna codec, whose tables take a megabyte of the locked memory of a robot
         *labels, last = name.split(".")
         return all(0 < len(label) < 64 for label in labels) and len(last) < 64
     try:
@@ -215,7 +215,7 @@ def host_problem(hosts: Sequence[str], listen_host: str) -> str:
         hosts: the `Host` headers.
         listen_host: host of the listening endpoint.
     """
-    # A foreign site can point a name of its own at this machine (DNS rebinding). It cannot own an address, a name
+    # A third-party site can point its own name at this machine (DNS rebinding). It cannot use an address, a name
     # without a dot, a name in `.local`, or the name of this endpoint.
     if len(hosts) != 1:
         return "a request must contain its Host once"
@@ -226,10 +226,10 @@ def host_problem(hosts: Sequence[str], listen_host: str) -> str:
 
 
 def stop_addresses(endpoints: Sequence[str]) -> list[tuple[str, int]]:
-    """Return the UDP addresses of the STOP port beside `endpoints`, each once: the same host, the next higher port.
+    """Return the UDP addresses of the STOP ports of `endpoints`, each once: the same host, the next higher port.
 
-    The port beside the default endpoint is 7448. So robots on one machine have different STOP ports, and an
-    answer is never that of another robot. The legacy protocol has no STOP.
+    The STOP port of the default endpoint is 7448. So robots on one machine have different STOP ports, and no answer
+    comes from another robot. The legacy protocol has no STOP.
     """
     places = []
     for endpoint in endpoints:
@@ -244,7 +244,7 @@ def stop_addresses(endpoints: Sequence[str]) -> list[tuple[str, int]]:
     return list(dict.fromkeys(places))
 
 
-# UDP port of discovery on each machine that listens beyond loopback: that of Zenoh plus three.
+# UDP port of discovery on each machine that listens beyond loopback: the port of Zenoh plus three.
 MULTICAST_PORT: Final = 7449
 LOOPBACK: Final = ("localhost", "127.", "::1")
 
@@ -255,10 +255,10 @@ def uses_discovery(listen: Sequence[str]) -> bool:
 
 
 def own_stop_addresses(listen: Sequence[str]) -> list[tuple[str, int]]:
-    """Return the UDP addresses of the STOP port to open beside `listen`.
+    """Return the UDP addresses of the STOP ports to open for `listen`.
 
     Raises:
-        ConfigError: one is that of discovery. Only one of the two could be opened.
+        ConfigError: an address is that of discovery. Only one of the two could be opened.
     """
     for endpoint in listen if uses_discovery(listen) else ():
         if any((host, MULTICAST_PORT) in stop_addresses([endpoint]) for host in ("0.0.0.0", "::")):

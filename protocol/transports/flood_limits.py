@@ -1,9 +1,9 @@
 """Limit the connections that one address opens to the ports of the links; report a flood. Shell (sockets, a thread).
 
 Zenoh accepts connections itself and has no limit per address. So the kernel holds a connection back until its first
-byte, and drops what comes from an address that floods before it has a connection, by a filter on the listening sockets.
-Sessions that are open, and all other addresses, go on; no frame is copied.
-docs/explanation/decisions/0010-floods.md states what else was tried.
+byte. A filter on the listening sockets drops new connections of an address that floods. Open sessions, and all other
+addresses, continue; no frame is copied.
+docs/explanation/decisions/0010-floods.md describes the alternatives.
 """
 
 import ctypes
@@ -32,34 +32,34 @@ from sightline.protocol.transports.endpoints import parse_websocket_endpoint, pa
 from sightline.protocol.transports.zenoh.session import MAX_SESSIONS
 
 MAX_OPEN: Final = MAX_SESSIONS
-"""Connections of one address, half-open ones included: as many as Zenoh accepts from all addresses, and more than
-WebSocket does."""
+"""Connections of one address, including half-open ones: as many as Zenoh accepts from all addresses, and more than
+WebSocket accepts."""
 MAX_NEW: Final = MAX_SESSIONS
 """New connections of one address within `WINDOW_US`."""
 WINDOW_US: Final = 3_000_000
 BLOCKED_US: Final = 10_000_000
 """After this time without a flood the address may connect again."""
 MAX_BLOCKED: Final = 64
-"""Security limit: addresses that are blocked at a time."""
+"""Security limit: addresses that are blocked at the same time."""
 _CHECK_S: Final = 0.2
 _QUIET_US: Final = 2_000_000
-"""Longest time between two looks at the table. A flood that opens no connection is found so late."""
+"""Longest time between two readings of the table, and longest delay for a flood that opens no connection."""
 _OWN: Final = (OWN_HOST, "::1")
-"""This machine: its floods are reported and not blocked, because its services share one address."""
+"""Addresses of this machine. Its floods are reported but not blocked, because its services share one address."""
 
 
 class Flood(NamedTuple):
-    """A host over a limit: its connections now, and its new ones in a second."""
+    """A host above a limit: its current connections, and its new connections in a second."""
 
     host: str
     open: int
     new_per_s: float
     begins: bool
-    """False while an earlier flood of the host goes on."""
+    """False while an earlier flood of the host continues."""
 
 
 class FloodDetector:
-    """Finds the hosts that flood, from samples of the connections to a port. Computes only."""
+    """Finds the hosts that flood, from samples of the connections to a port. Without side effects."""
 
     def __init__(self) -> None:
         self._known: frozenset[tuple[str, str]] = frozenset()
@@ -70,15 +70,15 @@ class FloodDetector:
     def sample(
         self, ends: dict[tuple[str, str], str], now_us: int, accepted: Mapping[str, int] = MappingProxyType({})
     ) -> list[Flood]:
-        """Take a sample. Returns the hosts that are over a limit now.
+        """Process a sample. Returns the hosts that are above a limit now.
 
         Args:
             ends: connection (local and remote end) -> its host.
             now_us: time of the sample.
-            accepted: host -> connections since the last sample, of the hosts for which this is counted.
+            accepted: host -> accepted connections since the last sample, for hosts with such a count.
         """
         new_now = Counter(ends[end] for end in ends.keys() - self._known)
-        for host, count in (new_now | Counter(accepted)).items():  # the larger of both
+        for host, count in (new_now | Counter(accepted)).items():  # the larger of both counts
             self._new.setdefault(host, deque()).append((now_us, count))
         self._known = frozenset(ends)
         for host, samples in list(self._new.items()):
@@ -86,7 +86,7 @@ class FloodDetector:
                 samples.popleft()
             if not samples:
                 del self._new[host]
-        # Both limits: short connections are few at a time, and half-open ones are not new.
+        # Both limits are needed: short connections are seldom open at the same time, and half-open ones are not new.
         open_now = Counter(ends.values())
         floods = []
         for host in open_now.keys() | self._new.keys():
@@ -109,7 +109,7 @@ _accepted: Final = Counter[str]()
 
 def note_accepted(host: str) -> None:
     """Count a connection that this process has accepted, because a short one may end between two samples."""
-    # Without `limit_floods` in this process nothing empties it, so the number of hosts is bounded.
+    # Without `limit_floods` in this process the counts are never cleared, so the number of hosts is limited.
     if host in _accepted or len(_accepted) < MAX_BLOCKED:
         _accepted[host] += 1
 
@@ -122,7 +122,7 @@ def limit_floods(listen: Sequence[str], report: Callable[[str], None]) -> Iterat
     read = partial(connection_ends, ports)
     if all(_is_ipv4(_address(endpoint)[0]) for endpoint in listen):
         read = partial(connection_ends, ports, TCP_IPV4)
-    # WebSocket ends a silent connection after 2 s itself (clause 14.4); one that the kernel holds back would stay open.
+    # WebSocket ends a silent connection after 2 s itself (clause 14.4), but not one that the kernel holds back.
     zenoh_ports = {_address(endpoint)[1] for endpoint in listen if "://" not in endpoint}
     ending = threading.Event()
     if ports:
@@ -141,7 +141,7 @@ def _address(endpoint: str) -> tuple[str, int]:
 
 
 def _is_ipv4(host: str) -> bool:
-    """Return True for an address of IPv4. A name may have one of IPv6 as well."""
+    """Return True for an IPv4 address. A name may have an IPv6 address, too."""
     with suppress(ValueError):
         return ipaddress.ip_address(host).version == 4
     return False
@@ -154,20 +154,20 @@ def _watch(
     detector, limiter, blocked, silent = FloodDetector(), RepeatLimiter(), list[str](), set[Peer]()
     deferred, floods, opened, read_us = 0, list[Flood](), None, 0
     while not ending.wait(_CHECK_S):
-        if deferred < len(zenoh_ports):  # a link opens its ports some time after this thread begins
+        if deferred < len(zenoh_ports):  # a link opens its ports some time after the start of this thread
             deferred = _defer(_listeners(zenoh_ports))
         now_us = heartbeat_us()
-        # Without a new connection there is hardly a new flood, and a table takes 3 to 5 ms to read.
+        # Without a new connection a new flood is unlikely, and reading the table takes 3 to 5 ms.
         opened_before, opened = opened, opened_connections()
         is_quiet = opened is not None and opened == opened_before and not floods and not blocked
         if is_quiet and now_us - read_us < _QUIET_US:
             continue
         read_us = now_us
-        # A connection that comes between these two lines is not counted, which a flood does not need.
+        # A connection between these two lines is not counted, which does not matter for a flood.
         accepted = dict(_accepted)
         _accepted.clear()
         floods = detector.sample(read(), now_us, accepted)
-        # Before the report, so that what the log states is true.
+        # Before the report, so that the log is correct.
         if detector.blocked(now_us) != blocked:
             blocked = detector.blocked(now_us)
             _block(ports, blocked)
@@ -189,44 +189,44 @@ def _line(flood: Flood) -> str:
             "sessions go on; block that address or end the program there")
 
 
-# Half-open connections of a host that floods. Zenoh does one TLS handshake at a time, and waits 10 s for a peer that
+# Half-open connections of a host that floods. Zenoh runs one TLS handshake at a time, and waits 10 s for a peer that
 # does not continue.
 
 
 Peer = tuple[str, int]
 _ACKED_BYTES: Final = struct.Struct("120xQ")
-"""`tcpi_bytes_acked` in `struct tcp_info` of linux/tcp.h: what the peer has received from this end."""
+"""`tcpi_bytes_acked` in `struct tcp_info` of linux/tcp.h: bytes that the peer has acknowledged."""
 _DEFER_S: Final = 10
 
 
 def _defer(inodes: set[str]) -> int:
-    """Let the kernel accept a connection with its first byte, which an honest peer sends when it connects.
+    """Let the kernel accept a connection with its first byte. An honest peer sends it when it connects.
 
-    Returns the number of own sockets among `inodes`. Others may listen on the same port of another address.
+    Returns the number of own sockets among `inodes`. Another process may listen on the same port of another address.
     """
     count = 0
     for listener in own_sockets(inodes.__contains__):
-        # The option may be set while the socket listens already. It holds for connections from now on.
+        # The option may be set while the socket already listens. It applies to later connections.
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, _DEFER_S)
         count += 1
     return count
 
 
 def _end_half_open(ports: set[int], hosts: Sequence[str], waiting: set[Peer]) -> set[Peer]:
-    """End connections from `hosts` that nothing was sent to since the last turn. Returns those that wait since now.
+    """End connections from `hosts` that received no byte in two turns. Returns those that now wait for the first time.
 
-    A session that is open has received bytes. A peer that is silent, or stops amid a handshake, has not.
+    An open session has received bytes. A peer that is silent, or stops in a handshake, has not.
     """
     unanswered: set[Peer] = set()
     for one in own_sockets():
-        with suppress(OSError):  # no TCP socket
+        with suppress(OSError):  # not a TCP socket
             if one.family not in (socket.AF_INET, socket.AF_INET6) or one.getsockname()[1] not in ports:
                 continue
             host, port = one.getpeername()[:2]
             info = one.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _ACKED_BYTES.size)
             if host.removeprefix("::ffff:") not in hosts or _ACKED_BYTES.unpack(info)[0]:
                 continue
-            # Twice in a row, because an honest peer may be amid its handshake now.
+            # In two turns, because an honest peer may be in its handshake now.
             unanswered.add((host, port))
             if (host, port) in waiting:
                 one.shutdown(socket.SHUT_RDWR)
@@ -247,10 +247,10 @@ _PASS, _DROP = 0xFFFF_FFFF, 0
 def source_filter(addresses: Sequence[int]) -> list[tuple[int, int, int, int]]:
     """Return the instructions (code, jump if true, jump if false, operand) that drop packets from IPv4 `addresses`.
 
-    A listening socket receives the packets of connections that it has not accepted, no others. A session inherits the
-    filter of the moment when it was opened, which did not list its address.
+    A listening socket receives only packets of connections that are not yet accepted. A session inherits the filter of
+    the moment when it was opened, which did not contain its address.
     """
-    # Addresses of IPv6 are not listed: a sender has many of them.
+    # IPv6 addresses are not listed, because a sender has many of them.
     rows = len(addresses)
     checks = [(_IF_EQUAL, rows - place, 0, address) for place, address in enumerate(addresses)]
     return [
@@ -265,7 +265,7 @@ def source_filter(addresses: Sequence[int]) -> list[tuple[int, int, int, int]]:
 
 
 def _block(ports: set[int], hosts: Sequence[str]) -> None:
-    """Drop new connections from `hosts` on the listening sockets of this process, and from no other host."""
+    """Drop new connections from exactly `hosts` on the listening sockets of this process."""
     addresses = [int(ip) for host in hosts if (ip := ipaddress.ip_address(host.partition("%")[0])).version == 4]
     program = b"".join(_INSTRUCTION.pack(*row) for row in source_filter(addresses))
     buffer = ctypes.create_string_buffer(program)
@@ -275,5 +275,5 @@ def _block(ports: set[int], hosts: Sequence[str]) -> None:
 
 
 def _listeners(ports: set[int]) -> set[str]:
-    """Return the names that listening sockets on `ports` have in `/proc/self/fd`."""
+    """Return the names of listening sockets on `ports` in `/proc/self/fd`."""
     return {f"socket:[{inode}]" for inode in listening_inodes(ports)}

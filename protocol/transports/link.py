@@ -1,7 +1,7 @@
 """Define the transport interface: `Link`, `Message`, slots, queues, and the rules of every link. Shell (locks).
 
 A `Link` belongs to one robot id. `tests/protocol/transports/test_link.py` checks its promises on every transport:
-newest wins, memory is bounded, both ends may restart, an error in a callback ends nothing, `close` never hangs.
+newest wins, memory is bounded, both ends may restart, a callback error ends nothing, `close` never hangs.
 """
 
 import sys
@@ -52,12 +52,12 @@ class Message:
 
 
 class LatestSlot(Generic[Item]):
-    """Holds the newest item. A new item replaces one that no thread took, and counts it. Safe between threads."""
+    """Stores the newest item. A new item replaces one that no thread took, and counts it. Thread-safe."""
 
     def __init__(self) -> None:
-        # Two plain locks: a condition would wake the taker a third slower, on the path of every frame and command.
+        # Two plain locks, because a condition wakes the taker a third slower, for every frame and command.
         self._guard = threading.Lock()
-        # Free while there is an item. The thread that acquires it takes the item.
+        # Released while there is an item. The thread that acquires it takes the item.
         self._full = threading.Lock()
         self._full.acquire()
         self._item: Item | None = None
@@ -100,7 +100,7 @@ def rank(channel: Channel, verb: Verb | None) -> int:
 
 
 class _Place(NamedTuple):
-    """The place of an item in a queue. A newer item replaces only an item in the same place."""
+    """The place of an item in a queue. A newer item replaces only the item in the same place."""
 
     rank: int
     channel: str = ""
@@ -111,8 +111,8 @@ class _Place(NamedTuple):
 class OutgoingQueue(Generic[Item]):
     """Queues the newest item per channel and source, for requests also per verb. The most urgent item leaves first.
 
-    Only another STOP replaces a STOP. Sources without a role share a few places on channels that are passed on. The
-    source of a role always has a place.
+    Only another STOP replaces a STOP. Sources without a role share a few places on relayed channels. A source with a
+    role always has a place.
     """
 
     def __init__(self, max_items: int = sys.maxsize) -> None:
@@ -120,9 +120,9 @@ class OutgoingQueue(Generic[Item]):
         self._max_items = max_items
         self._lock = threading.Lock()
         self._items: dict[_Place, Item] = {}
-        # Fixed keys, so that other threads may read it without the lock.
+        # The keys are fixed, so that other threads may read it without the lock.
         self.dropped = Counter(dict.fromkeys(CHANNELS, 0))
-        """Items that were replaced before they were sent, or found no place, by channel."""
+        """Items that were replaced before they were sent, or had no place, by channel."""
 
     def __len__(self) -> int:
         return len(self._items)
@@ -131,7 +131,7 @@ class OutgoingQueue(Generic[Item]):
         """Queue an item. Never blocks.
 
         Args:
-            message: decides place and order: its channel, source and verb.
+            message: its channel, source and verb give place and order.
             item: the form in which the transport sends the message.
 
         Returns:
@@ -182,7 +182,7 @@ class OutgoingQueue(Generic[Item]):
     def _make_room(self, place: _Place, channel: Channel) -> bool:
         if len(self._items) >= self._max_items:
             return place.verb is Verb.STOP and self._drop_one()
-        # A relayed channel accepts any source. Without this bound, one peer with invented sources fills the queue.
+        # A relayed channel accepts any source. Without this limit, a peer with invented sources could fill the queue.
         if not channel.passed_on or place.source in KNOWN_SOURCES:
             return True
         unknown = (one for one in self._items if one.channel == place.channel and one.source not in KNOWN_SOURCES)
@@ -190,7 +190,7 @@ class OutgoingQueue(Generic[Item]):
 
     def _drop_one(self) -> bool:
         """Drop an item that is not a STOP, otherwise the oldest STOP."""
-        # Every STOP has the same effect, so one of many is enough.
+        # Every STOP has the same effect, so one of several is sufficient.
         oldest = next((place for place in self._items if place.verb is not Verb.STOP), next(iter(self._items)))
         self.dropped[oldest.channel] += 1
         del self._items[oldest]
@@ -198,11 +198,11 @@ class OutgoingQueue(Generic[Item]):
 
 
 class Closing(ABC):
-    """Base of objects for a `with`, which closes them at its end."""
+    """Base of context managers that close themselves at the end of `with`."""
 
     @abstractmethod
     def close(self) -> None:
-        """Close it. Idempotent, returns within two seconds."""
+        """Close the object. Idempotent, returns within two seconds."""
 
     def __enter__(self) -> Self:
         return self
@@ -218,7 +218,7 @@ class Link(Closing):
 
     robot: str
     is_routed = False
-    """True if the peers of this end receive each other's messages without it."""
+    """True if the peers of this end receive each other's messages without this end."""
 
     @property
     @abstractmethod
@@ -261,14 +261,15 @@ class Link(Closing):
         """Return True if a peer subscribes to `channel`. Use it to save work, never for safety."""
 
     def watch_drivers(self, callback: Callable[[str, bool], None]) -> None:
-        """Call `callback` with each driver's token of this robot, and whether it is present.
+        """Call `callback` with each driver token of this robot, and True if it appeared or False if it ended.
 
-        Only Zenoh has tokens (`protocol/transports/tokens.py`); on other links the lease alone ends.
+        Only Zenoh has tokens (`protocol/transports/tokens.py`). On other links only the lease ends.
         """
 
     @property
     def dropped(self) -> Counter[str]:
-        """Return the publications that newer ones replaced before they left, by channel, if the link counts them."""
+        """Return the publications that newer ones replaced before they were sent, by channel, if the link counts them.
+        """
         return Counter()
 
     @property
@@ -280,7 +281,7 @@ class Link(Closing):
         """Subscribe to `channel` with a slot.
 
         Returns:
-            The slot. It holds the newest message that no thread took.
+            The slot with the newest message that no thread took.
         """
         slot: LatestSlot[Message] = LatestSlot()
         self.subscribe(channel, slot.put)
@@ -298,7 +299,7 @@ class FleetLink(Closing):
     @property
     @abstractmethod
     def losses(self) -> int:
-        """Return how often the last peer was lost. It increases just after the tokens of that peer ended."""
+        """Return how many times the last peer was lost. The count increases after the tokens of that peer ended."""
 
     @abstractmethod
     def robots(self) -> list[str]:
@@ -306,14 +307,14 @@ class FleetLink(Closing):
 
     @abstractmethod
     def on_new_robot(self, callback: Callable[[], None]) -> None:
-        """Call `callback` on a transport thread at the first message of each robot, again after it was forgotten."""
+        """Call `callback` on a transport thread at the first message of each robot, also after it was forgotten."""
 
     @abstractmethod
     def link(self, robot: str) -> Link:
-        """Return a new link to one robot. It closes with this one, if not before.
+        """Return a new link to one robot. It closes with this object, if not before.
 
         Args:
-            robot: robot id, also of a robot without a message so far.
+            robot: robot id, also of a robot that has not sent a message yet.
 
         Raises:
             ConfigError: the robot id is invalid.
@@ -321,26 +322,26 @@ class FleetLink(Closing):
 
     @abstractmethod
     def declare_token(self, token: AnyToken) -> Callable[[], None]:
-        """Declare a token. It ends with the returned function, which the caller keeps, with the session or process."""
+        """Declare a token. It ends with a call of the returned function, or with the session or process."""
 
     @abstractmethod
     def watch_tokens(self, callback: Callable[[Token, bool], None]) -> Callable[[], None]:
-        """Call `callback` on a transport thread with each token of robots and vision services, and its presence.
+        """Call `callback` on a transport thread with each token of robots and vision services, True for present.
 
         Returns:
-            What ends it. It ends with the session, too.
+            A function that ends the watch. The watch also ends with the session.
         """
 
     @abstractmethod
     def find_robots(self) -> set[str]:
-        """Query the ids of all robots, also of those without a token or a status, within half a second."""
+        """Query the ids of all robots, also without a token or status, within half a second."""
 
     @abstractmethod
     def watch_detectors(self, group: str, callback: Callable[[DetectorToken, bool], None]) -> Callable[[], None]:
-        """Call `callback` on a transport thread with each token in `group`, and whether it is present.
+        """Call `callback` on a transport thread with each token in `group`, and True if it is present.
 
         Returns:
-            What ends it. It ends with the session, too.
+            A function that ends the watch. The watch also ends with the session.
         """
 
 
@@ -391,16 +392,16 @@ class LinkWrapper(Link):
         self._link.close()
 
 
-# The rules of every link on any transport: exact keys, bounds, contained callbacks. Shell (a lock).
+# The rules of every link on any transport: exact keys, size limits, contained callback errors. Shell (a lock).
 #
 # A bad message, or an error in a callback, is counted and dropped. Neither ends a link.
 
 
-# Counted for a key that differs from that of the robot and channel: a wildcard, another robot, a bad role.
+# Counter of keys that differ from that of the robot and channel: a wildcard, another robot, an invalid role.
 INEXACT_KEY = "INEXACT_KEY"
-# Counted for a header or payload above the bound of the channel.
+# Counter of headers or payloads above the limit of the channel.
 OVERSIZE = "OVERSIZE"
-# Counted for a sample that is not a publication, e.g. Zenoh's delete.
+# Counter of samples that are not publications, e.g. Zenoh's delete.
 NOT_A_PUT = "NOT_A_PUT"
 
 
@@ -486,7 +487,7 @@ class LinkRules:
 
 
 class BaseLink(Link):
-    """Base of the links of a transport, with rules and counters."""
+    """Base class of the links of a transport, with rules and counters."""
 
     def __init__(self, rules: LinkRules) -> None:
         self.robot = rules.robot

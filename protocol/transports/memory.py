@@ -5,8 +5,8 @@
     robot.publish(FRAME, header, jpeg)
     network.advance(now_us)  # callbacks run here, each at its own due time
 
-Each way between two links has its own random stream per key, so that more `status` does not change the lost frames. A
-way keeps its order, as a TCP connection does.
+Each way between two links has a separate random stream per key, so that more `status` does not change the lost frames.
+A way keeps the order of its messages, as a TCP connection does.
 """
 
 import heapq
@@ -19,13 +19,13 @@ from typing import Final, NamedTuple
 from sightline.protocol.channels import FRAME, Channel, Direction, parse_key, pattern_for
 from sightline.protocol.transports.link import BaseLink, LinkRules, Message
 
-# Messages in flight in one network. A further message is dropped and counted as `overflow`.
+# Limit of messages in flight in one network. Further messages are dropped and counted as `overflow`.
 MAX_IN_FLIGHT: Final = 4096
 
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """The effect of one direction on a message. `loss` is a share 0..1, `burst` the mean number lost in a row, >= 1."""
+    """The effect of one direction on a message. `loss`: share 0..1; `burst`: mean number lost in a row, >= 1."""
 
     delay_us: int = 0
     jitter_us: int = 0
@@ -33,7 +33,7 @@ class Leg:
     burst: float = 1.0
 
     def __post_init__(self) -> None:
-        """Raise ValueError for impossible values."""
+        """Raise ValueError for invalid values."""
         if self.delay_us < 0 or self.jitter_us < 0 or not 0 <= self.loss <= 1 or not self.burst >= 1:
             raise ValueError(f"invalid {self}: expected delay and jitter >= 0, loss 0..1, burst >= 1")
         if self.burst > 1 and self.loss > self.burst / (self.burst + 1):
@@ -49,7 +49,7 @@ def split_legs(delay_us: int, jitter_us: int, loss: float, burst: float) -> dict
 
 
 class _Way:
-    """One channel from one link to another: its random stream, its burst, its order."""
+    """One channel from one link to another, with its random stream, its burst state and its order."""
 
     def __init__(self, name: str, leg: Leg) -> None:
         self._random = Random(name)
@@ -63,7 +63,7 @@ class _Way:
         lost, jitter_us = self._loses(self._random.random()), int(self._random.random() * (self._leg.jitter_us + 1))
         if lost:
             return None
-        # Never before the message ahead of it, because a TCP connection delivers in order.
+        # Never before the previous message, because a TCP connection delivers in order.
         self._last_due_us = max(self._last_due_us, now_us + self._leg.delay_us + jitter_us)
         return self._last_due_us
 
@@ -71,7 +71,7 @@ class _Way:
         loss, burst = self._leg.loss, self._leg.burst
         if burst == 1:
             return draw < loss
-        # Gilbert's model: it leaves the state "losing" with 1/burst, and enters it so that the share is `loss`.
+        # Gilbert model: leave the state "losing" with probability 1/burst; enter it so that the share is `loss`.
         self._losing = draw >= 1 / burst if self._losing else draw < loss / (burst * (1 - loss))
         return self._losing
 
@@ -124,7 +124,7 @@ class MemoryNetwork:
             legs: separate values for each direction, in place of the others.
 
         Raises:
-            ValueError: a value is impossible.
+            ValueError: a value is invalid.
         """
         self.now_us = 0
         self.sent: Counter[str] = Counter()
@@ -150,7 +150,7 @@ class MemoryNetwork:
         return [other for other in self._links if other is not link and other.robot == link.robot]
 
     def declare_token(self, robot: str, token: str) -> Callable[[], None]:
-        """Declare the token of a driver of `robot`. It ends with the returned function."""
+        """Declare a driver token of `robot`. It ends with the returned function."""
         def show(is_present: bool) -> None:
             for link in self._links:
                 if link.robot == robot:
@@ -161,8 +161,8 @@ class MemoryNetwork:
 
     def leave(self, link: "MemoryLink") -> None:
         """Remove `link` and all messages in flight to it."""
-        # Messages to a closed link must not arrive at a later link of the same robot. Its streams go too, so that the
-        # number of ways stays bounded over many restarts.
+        # Messages to a closed link must not arrive at a later link of the same robot. Its streams are removed, too, so
+        # that their number stays bounded over many restarts.
         self._links = [other for other in self._links if other is not link]
         self._flights = [flight for flight in self._flights if flight.to is not link]
         heapq.heapify(self._flights)
@@ -197,7 +197,7 @@ class MemoryNetwork:
         due_us = self._way(packet, to).due_us(self.now_us)
         if due_us is None:
             self.dropped[packet.direction.name] += 1
-            # The result is as for a delivered message, because a real sender does not learn of a loss.
+            # The result is that of a delivered message, because a real sender does not learn of a loss.
             return True
         if len(self._flights) >= MAX_IN_FLIGHT:
             self.dropped["overflow"] += 1
@@ -223,12 +223,12 @@ class MemoryLink(BaseLink):
     """A `Link` of a `MemoryNetwork`. It does not receive its own publications."""
 
     def __init__(self, network: MemoryNetwork, number: int, rules: LinkRules) -> None:
-        """Use `MemoryNetwork.link` in place of this constructor."""
+        """Use `MemoryNetwork.link` instead of this constructor."""
         super().__init__(rules)
         self.number = number
         self._network = network
         self._callbacks: list[tuple[Channel, str, Callable[[Message], None]]] = []
-        """Channel, the pattern of its keys, callback."""
+        """Channel, pattern of its keys, callback."""
         self._on_token: Callable[[str, bool], None] | None = None
 
     @property
@@ -256,16 +256,16 @@ class MemoryLink(BaseLink):
         return not self._closed and any(peer.subscribes_to(key) for peer in self._network.peers_of(self))
 
     def watch_drivers(self, callback: Callable[[str, bool], None]) -> None:
-        """Call `callback` with each token that is declared from now on, and with its end."""
+        """Call `callback` with each token that is declared from now on, and at its end."""
         self._on_token = callback
 
     @property
     def watches_drivers(self) -> bool:
-        """Return True if this end watches the tokens of drivers."""
+        """Return True if this end watches driver tokens."""
         return self._on_token is not None
 
     def see_token(self, token: str, is_present: bool) -> None:
-        """Deliver a token at once."""
+        """Deliver a token immediately."""
         if self._on_token is not None:
             self._on_token(token, is_present)
 

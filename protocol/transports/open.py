@@ -1,6 +1,6 @@
 """Open a link on a set of endpoints, join several links into one, and relay between them. Shell.
 
-A robot may listen on several transports. Its link then contains one link of each, with the same rules.
+A robot may listen on several transports. Its link then contains one link for each, with the same rules.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from sightline.protocol.channels import CHANNELS, FRAME, Channel
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.link import Link, Message
 
-# A peer that runs answers within this. A silent command of several seconds looks as if it hangs.
+# Time in which a running peer answers. A command without output for several seconds looks as if it hangs.
 ANNOUNCED_AFTER_S: Final = 1.0
 _log: Final = logging.getLogger(__name__)
 
@@ -55,9 +55,9 @@ def open_link(
     options: dict[str, Any] = {"role": role, "timeout_s": timeout_s, "max_frame_bytes": max_frame_bytes}
     web, zenoh = ([_of_kind(ends, is_web) for ends in (listen, connect)] for is_web in (True, False))
     links: list[Link] = []
-    # If one endpoint fails, the others must not stay open, because the robot would answer on one transport only.
+    # If one endpoint fails, the others must not stay open. Otherwise the robot would answer on one transport only.
     with _announced(connect), ExitStack() as undo:
-        # Without any endpoint Zenoh prints the error, because it is the default transport.
+        # Without any endpoint Zenoh reports the error, because it is the default transport.
         if any(zenoh) or not any(web):
             from sightline.protocol.transports.zenoh.link import open_zenoh
 
@@ -73,7 +73,7 @@ def open_link(
 
 
 def check_link(listen: Sequence[str], connect: Sequence[str], role: str, secure: str) -> None:
-    """Raise ConfigError for endpoints, keys or tokens without which `open_link` fails. Opens nothing."""
+    """Raise ConfigError for endpoints, keys or tokens with which `open_link` fails. Opens nothing."""
     from sightline.protocol.transports.endpoints import check_zenoh_endpoints, parse_websocket_endpoint
     from sightline.protocol.transports.security import check_listening, load_role_keys, read_tokens
     from sightline.protocol.transports.websocket.tls import client_tls_context, server_tls_context
@@ -95,7 +95,7 @@ def check_link(listen: Sequence[str], connect: Sequence[str], role: str, secure:
 def _announced(connect: Sequence[str]) -> Iterator[None]:
     """Log the addresses once if they do not answer soon."""
     timer = threading.Timer(ANNOUNCED_AFTER_S, _log.info, ("connecting to %s ...", ", ".join(connect)))
-    # It must not delay the end of a command.
+    # A daemon, so that it does not delay the end of a command.
     timer.name, timer.daemon = "connecting", True
     if connect:
         timer.start()
@@ -126,7 +126,7 @@ class LinkGroup(Link):
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
         """Publish on all links. Returns True if at least one accepted the message."""
-        # A list, not a generator: `any` would stop at the first link that accepts, and the others would get nothing.
+        # A list, because `any` over a generator would stop at the first link that accepts the message.
         taken = [link.publish(channel, header, payload, source) for link in self.links]
         return any(taken)
 
@@ -167,21 +167,21 @@ class LinkGroup(Link):
 
 # The relay of a robot between its transports. Shell.
 #
-# Peers of one transport do not need it: on Zenoh they meet at the router, and the listening WebSocket end passes on.
+# Peers of one transport do not need it: on Zenoh the router connects them, and a listening WebSocket end forwards.
 
 
 class Relay:
-    """Forwards messages between links, as the table of channels defines. Overlays need a viewer on another link."""
+    """Forwards messages between links, as the channel table defines. Overlays need a viewer on another link."""
 
     def __init__(self, link: Link) -> None:
-        """Start with the channels that are always passed on."""
+        """Start with the channels that are always forwarded."""
         self._links: tuple[Link, ...] = link.links if isinstance(link, LinkGroup) else (link,)
         self._watched = [one for one in CHANNELS.values() if one.while_watched]
         self._open: set[tuple[str, int]] = set()
         for channel in CHANNELS.values():
             if channel.passed_on and not channel.while_watched:
                 for near in self._links:
-                    # A WebSocket end passes on what it subscribes to. Zenoh does it without this process, and a
+                    # A WebSocket end forwards only subscribed channels. Zenoh forwards without this process, and a
                     # subscription here would make a vision service send the boxes of each frame.
                     if self._others(near) or not near.is_routed:
                         self._begin(channel, near)

@@ -33,10 +33,10 @@ from sightline.protocol.transports.tokens import PREFIX as TOKEN_PREFIX
 
 ROBOT_ROLE: Final = "robot"
 ROLES: Final = (ROBOT_ROLE, *SOURCES_OF_ROLE)
-# A router passes on the messages of all roles to another one. It has no token: WebSocket has no routers.
+# A router forwards the messages of all roles to another router. It has no token, because WebSocket has no routers.
 ROUTER_ROLE: Final = "router"
 CERTIFICATES: Final = (*ROLES, ROUTER_ROLE)
-# Prefix of the keys of presence (`transports/zenoh/presence.py`), next to `sightline/`, the prefix of channels.
+# Prefix of presence keys (`transports/zenoh/presence.py`), next to `sightline/`, the prefix of channels.
 PRESENCE_PREFIX: Final = "sightline-presence"
 _TLS: Final = ("tls", "quic")
 
@@ -56,13 +56,13 @@ class RoleKeys:
     role: str
 
     def check(self, endpoints: Sequence[str]) -> None:
-        """Raise ConfigError for an endpoint without TLS, so that no link becomes plain silently."""
+        """Raise ConfigError for an endpoint without TLS, so that no link is silently unencrypted."""
         for endpoint in endpoints:
             if parse_zenoh_endpoint(endpoint)[0] not in _TLS:
                 raise ConfigError(f"{endpoint} has no TLS: with --secure use tls/<host>:<port> or quic/...")
 
     def tls_section(self) -> dict[str, Any]:
-        """Return Zenoh's `transport/link/tls`. Both ends show a certificate of one private authority."""
+        """Return Zenoh's `transport/link/tls`. Both ends have a certificate of one private authority."""
         key, certificate = f"{self.folder}/{self.role}.key", f"{self.folder}/{self.role}.pem"
         return {
             "root_ca_certificate": f"{self.folder}/ca.pem",
@@ -87,7 +87,7 @@ class RoleKeys:
 
 
 def size_limit_section() -> list[dict[str, Any]]:
-    """Return Zenoh's `low_pass_filter`, so that the listening end drops a message above the bound of its channel."""
+    """Return Zenoh's `low_pass_filter`, so that the listening end drops a message above the limit of its channel."""
     return [
         {"id": f"size of {channel.name}", "flows": ["ingress"], "messages": ["put"], "key_exprs": [_pattern(channel)],
          "size_limit": MAX_HEADER_BYTES + channel.max_payload_bytes}
@@ -101,7 +101,7 @@ _ROUTER_RULES: Final = [{
                  "liveliness_query", "declare_liveliness_subscriber"],
     "key_exprs": [f"{KEY_PREFIX}/**", f"{PRESENCE_PREFIX}/**", ALL_TOKENS],
 }]
-"""Each of two linked routers has checked the role of the peer that a message comes from."""
+"""Each of two linked routers has already checked the role of a message's sender."""
 
 
 def load_role_keys(folder: str, source: str) -> RoleKeys | None:
@@ -155,7 +155,7 @@ def _pattern(channel: Channel) -> str:
 def _rules(role: str) -> list[dict[str, Any]]:
     """Return the access rules for a peer of `role`, in both directions."""
     published, received = may_publish(role), may_subscribe(role)
-    # A publisher must learn of subscriptions. Otherwise `has_listener` is False, and it publishes nothing.
+    # A publisher must see subscriptions. Otherwise `has_listener` is False, and it publishes nothing.
     listeners = sorted({_pattern(CHANNELS[key.split("/")[2]]) for key in published})
     rows = [
         ("publishes", "ingress", ["put"], published),
@@ -173,7 +173,7 @@ def _rules(role: str) -> list[dict[str, Any]]:
 
 
 def _presence_rows(role: str) -> list[tuple[str, str, list[str], list[str]]]:
-    """Return the presence rules. Each role may query all peers and reply as itself only."""
+    """Return the presence rules. Each role may query all peers, and reply only as itself."""
     own, all_of_it = [f"{PRESENCE_PREFIX}/{role}/*"], [f"{PRESENCE_PREFIX}/**"]
     return [
         ("replies", "ingress", ["declare_queryable", "reply"], own),
@@ -184,7 +184,7 @@ def _presence_rows(role: str) -> list[tuple[str, str, list[str], list[str]]]:
 
 
 def _token_rows(role: str) -> list[tuple[str, str, list[str], list[str]]]:
-    """Return the rules of liveliness tokens. All may see them, and three roles declare their kinds."""
+    """Return the rules of liveliness tokens. All roles may see them, and three roles declare their own kinds."""
     kinds = {ROBOT_ROLE: [ROBOT_KIND], "vision": [VISION_KIND, DRIVER_KIND], "detector": [DETECTOR_KIND]}
     own = kinds.get(role, [])
     return [
@@ -195,8 +195,8 @@ def _token_rows(role: str) -> list[tuple[str, str, list[str], list[str]]]:
     ]
 
 
-# The dates of the certificates in a `--secure` folder. Shell (reads files). A robot has no `cryptography`, and `ssl`
-# takes 4 MB.
+# The dates of the certificates in a `--secure` folder. Shell (reads files). A robot does not have `cryptography`, and
+# `ssl` takes 4 MB.
 
 
 EXPIRES_SOON: Final = datetime.timedelta(days=30)
@@ -206,7 +206,7 @@ _SEQUENCE: Final = 0x30
 def date_problem(
     folder: str, source: str, ahead: datetime.timedelta = EXPIRES_SOON, now: datetime.datetime | None = None
 ) -> str:
-    """Return what is wrong with the dates of the certificates of a link, or "" without one or without a folder.
+    """Return the problem with the dates of a link's certificates, or "" without a problem or a folder.
 
     Args:
         folder: folder from `sightline keys`, or "".
@@ -247,7 +247,7 @@ def _elements(der: bytes) -> Iterator[tuple[int, bytes]]:
     """Yield tag and content of each element."""
     while der:
         length, start = der[1], 2
-        # A long length: these seven bits are the number of its bytes.
+        # A long length: the low seven bits are the number of its bytes.
         if length > 0x7F:
             start += length & 0x7F
             length = int.from_bytes(der[2:start])
@@ -256,14 +256,14 @@ def _elements(der: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _time(text: str) -> datetime.datetime:
-    # The short form has two digits of a year from 1950 to 2049.
+    # The short form has a year of two digits, from 1950 to 2049.
     digits = text if len(text) > len("261130000000Z") else f"{'20' if text < '50' else '19'}{text}"
     return datetime.datetime.fromisoformat(f"{digits[:8]}T{digits[8:]}")
 
 
 # The tokens of roles in a `--secure` folder, one file each: `vision.token`, `operator.token` ... Shell (reads files).
 #
-# A client that shows the text of a token connects with that role.
+# A client with the text of a token connects in that role.
 
 
 _TOKEN: Final = re.compile(r"[A-Za-z0-9_-]{16,128}")
@@ -301,9 +301,9 @@ def _read(file: Path) -> str:
 # Access to a WebSocket endpoint: by token, or for the legacy protocol by address. Pure.
 
 
-# Counted for a client of the legacy protocol from an address that the owner did not list.
+# Counter of clients of the legacy protocol from an address that the owner did not list.
 NOT_LISTED: Final = "NOT_LISTED"
-# Counted for a client without a valid token.
+# Counter of clients without a valid token.
 NO_TOKEN: Final = "NO_TOKEN"
 
 _BEARER: Final = "bearer "
@@ -348,7 +348,7 @@ def role_of_token(tokens: Mapping[str, str], authorizations: Sequence[str], offe
     Args:
         tokens: token -> role.
         authorizations: the `Authorization` headers of the client.
-        offers: its `Sec-WebSocket-Protocol` headers; a browser cannot set the other one.
+        offers: its `Sec-WebSocket-Protocol` headers, because a browser cannot set `Authorization`.
 
     Returns:
         The role, or None without exactly one valid token.

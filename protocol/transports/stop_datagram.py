@@ -24,14 +24,14 @@ except ImportError:
     from _sha256 import sha256  # type: ignore[import-not-found]
 
 STOP_PORT: Final = 7448
-"""UDP port beside the default port of a link. Beside another port of a link it is the next higher port, too."""
+"""UDP port next to the default port of a link. For any other port of a link it is the next higher port, too."""
 DATAGRAM_BYTES: Final = 112
 CHALLENGE_BYTES: Final = 16
 NO_CHALLENGE: Final = bytes(CHALLENGE_BYTES)
 STOP_SLOW_S: Final = 0.3
-"""Without proof of a STOP by then, the operator is warned."""
+"""Time without proof of a STOP after which the operator is warned."""
 STATES: Final = ("", "DISARMED", "HOLD", "ACTIVE", "DEGRADED", "STOPPED", "FAULT")
-"""States of the gate by their number in a datagram. The first one: the driver process is silent."""
+"""States of the gate by their number in a datagram. The first one means that the driver process is silent."""
 STOPPED: Final = STATES.index("STOPPED")
 _FORM: Final = struct.Struct(">4s4B32sQ16sQQ")
 _MAGIC: Final = b"STOP"
@@ -96,7 +96,7 @@ def unpack_stop(data: bytes) -> StopDatagram:
 
 
 def challenge_of(seed: bytes, host: str, port: int) -> bytes:
-    """Return the challenge for one address, which needs no memory.
+    """Return the challenge for one address. It needs no memory.
 
     Args:
         seed: random bytes of this start.
@@ -108,30 +108,31 @@ def challenge_of(seed: bytes, host: str, port: int) -> bytes:
 
 def check_hmac(data: bytes, secret: bytes) -> None:
     """Raise WireError WRONG_KEY unless `data` ends in the HMAC of `secret`. Takes constant time."""
-    # In constant time: otherwise the time of the answer reveals the correct part of a guess.
+    # In constant time, because otherwise the time of the answer reveals the correct part of a guess.
     if not compare_digest(data[_FORM.size :], _hmac(data[: _FORM.size], secret)):
         raise WireError(RejectReason.WRONG_KEY, "the HMAC is not that of this STOP secret")
 
 
 def _hmac(head: bytes, secret: bytes) -> bytes:
-    """Return HMAC-SHA256. The module `hmac` loads OpenSSL, 3 MB, for the same. Source: RFC 2104."""
+    """Return HMAC-SHA256. The module `hmac` would load OpenSSL, 3 MB. Source: RFC 2104."""
     key = (secret if len(secret) <= _BLOCK_BYTES else sha256(secret).digest()).ljust(_BLOCK_BYTES, b"\0")
     inner = sha256(key.translate(_INNER) + head).digest()
     return bytes(sha256(key.translate(_OUTER) + inner).digest())
 
 
-# The side that sends STOP: the datagrams to send, and when an answer proves the stop.
+# The sender of STOP: the datagrams to send, and the answers that prove the stop.
 
 
 _UNANSWERED: Final = 5
+"""STOPs in a row without an answer, after which the receiver may have restarted with another challenge."""
 _RECENT: Final = 25
-"""Datagrams, half a second of them: a receiver that has answered none of these is gone."""
+"""Number of datagrams, half a second of them. A receiver without an answer to any of them is gone."""
 _MAX_RECEIVERS: Final = 8
-"""After this many STOPs without an answer, the receiver may have started again, with another challenge."""
+"""Security limit: receivers, by their challenges, that count for one STOP."""
 
 
 class StopRequests:
-    """STOP of one robot, for one sender. The caller sends `datagrams()` repeatedly and hands in each answer."""
+    """STOP of one robot, for one sender. The caller sends `datagrams()` repeatedly and passes each answer."""
 
     def __init__(self, robot: str, secret: bytes, counter: int) -> None:
         """Begin a STOP.
@@ -144,15 +145,15 @@ class StopRequests:
         self.answer: StopDatagram | None = None
         """Newest answer."""
         self.has_other_secret = False
-        """Whether an answer had the HMAC of another secret."""
+        """True if an answer had the HMAC of another secret."""
         self._receivers: dict[bytes, tuple[StopDatagram, int | None]] = {}
-        """By challenge, the newest answer and the number of this STOP: what is applied must be that or a later one."""
+        """Challenge -> newest answer, and number of this STOP. The applied number must be at least this number."""
         self._robot, self._secret = robot, secret
         self._first = self._next = counter
         self._unanswered = 0
 
     def datagrams(self) -> list[bytes]:
-        """Return what to send now: a STOP, and with a secret the request for the challenge while it is not known."""
+        """Return the datagrams to send now: a STOP, and with a secret the challenge request until it is known."""
         challenges = sorted(self._live(), key=lambda challenge: -self._receivers[challenge][0].counter)
         if not challenges or (self._secret and self._unanswered >= _UNANSWERED):
             challenges.insert(0, NO_CHALLENGE)
@@ -164,9 +165,9 @@ class StopRequests:
         return pack_stop(StopDatagram(Kind.STOP, self._robot, self._next, challenge), self._secret)
 
     def on_datagram(self, data: bytes) -> bool:
-        """Take a datagram from the network. Returns True for a new challenge: send the STOP immediately.
+        """Process a received datagram. Returns True for a new challenge: send the STOP immediately.
 
-        Anything but an answer to this STOP is ignored, and with a secret also an answer without its HMAC.
+        Only an answer to this STOP counts, with a secret only with its HMAC.
         """
         try:
             one = unpack_stop(data)
@@ -178,20 +179,20 @@ class StopRequests:
             self.has_other_secret |= error.reason is RejectReason.WRONG_KEY
             return False
         self._unanswered = 0
-        # Another challenge is another start of the receiver, or a second robot of this id: its numbers are its own.
+        # Another challenge is another start of the receiver, or a second robot with this id, with its own numbers.
         self._receivers = self._live()
         is_new = one.challenge not in self._receivers
         if is_new and len(self._receivers) >= _MAX_RECEIVERS:
             return False
         since = None if is_new else self._receivers[one.challenge][1]
-        # An answer to a request for the challenge has no number: it was not counted as a STOP.
+        # An answer to a challenge request has no number, because the request is not counted as a STOP.
         if one.received:
             since = min(one.received, since or one.received)
         self.answer, self._receivers[one.challenge] = one, (one, since)
         return is_new and bool(self._secret)
 
     def _live(self) -> dict[bytes, tuple[StopDatagram, int | None]]:
-        """Return the receivers that have answered one of the last datagrams, or else the last one that answered."""
+        """Return the receivers that answered one of the last datagrams, or else the one that answered last."""
         return {challenge: known for challenge, known in self._receivers.items()
                 if known[0] is self.answer or known[0].counter > self._next - _RECENT}
 

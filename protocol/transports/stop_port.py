@@ -1,4 +1,4 @@
-"""Serve the STOP port in a process of its own, which does nothing else. Shell (sockets); standard library only."""
+"""Serve the STOP port in a separate process, which does nothing else. Shell (sockets); standard library only."""
 
 import json
 import os
@@ -18,12 +18,12 @@ Origin = tuple[int, Address]
 Replies = Iterable[tuple[bytes, Origin]]
 
 _AT_ONCE: Final = 64
-"""Datagrams of one socket before the next one is read, so that a flood on one address does not hold up another."""
+"""Datagrams of one socket before the next one is read, so that a flood on one address does not delay another."""
 _PERIOD_MS: Final = 100
 _RETRY_US: Final = 1_000_000
 _LONGEST: Final = 2048
 _IGNORED: Final = (signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP, signal.SIGHUP, signal.SIGTERM)
-"""Signals that reach all processes of a terminal or service. STOP is served until the others have ended."""
+"""Signals to all processes of a terminal or service. STOP is served until the other processes have ended."""
 
 
 def now_us() -> int:
@@ -39,8 +39,8 @@ class StopPort:
 
         Args:
             pipe: `SOCK_SEQPACKET` end; `serve` returns when the other end is closed.
-            addresses: to listen on.
-            outgoing: whether to open sockets for datagrams that begin here, on free ports.
+            addresses: addresses to listen on.
+            outgoing: True to also open sockets on free ports, for datagrams to other hosts.
         """
         self._pipe, self._missing = pipe, list(addresses)
         self._sockets: dict[int, socket.socket] = {}
@@ -49,7 +49,7 @@ class StopPort:
         self._retry_us = 0
         self._outgoing: dict[int, socket.socket] = {}
         for host in ("0.0.0.0", "::") if outgoing else ():
-            with suppress(OSError):  # a system without IPv6
+            with suppress(OSError):  # the system has no IPv6
                 one = self._add(_bound((host, 0)))
                 self._outgoing[one.family] = one
         self._bind_missing()
@@ -61,7 +61,7 @@ class StopPort:
         return one
 
     def _bind_missing(self) -> None:
-        # An address that is missing at start may come later: a Wi-Fi that is not up yet, or a receiver that still ends.
+        # An address may appear after the start, e.g. of a Wi-Fi, or become free when an earlier receiver ends.
         first = self._retry_us == 0
         self._retry_us = now_us() + _RETRY_US
         for address in list(self._missing):
@@ -81,8 +81,8 @@ class StopPort:
         self.send(b"L" + line.encode())
 
     def send(self, packet: bytes) -> bool:
-        """Send a packet to the process that started this one; False if there is no room."""
-        # Never wait: while no process reads the pipe, a STOP is in it already.
+        """Send a packet to the process that started this one. Returns False without room."""
+        # Without waiting: if the pipe is full, it already contains a STOP.
         try:
             self._pipe.send(packet, socket.MSG_DONTWAIT)
         except OSError:
@@ -91,18 +91,18 @@ class StopPort:
 
     def send_to(self, data: bytes, origin: Origin) -> None:
         """Send a datagram or drop it."""
-        # Drop rather than wait: the sender of a STOP repeats it, and is answered then.
+        # Without waiting: the sender of a STOP repeats it, and gets an answer then.
         with suppress(OSError, KeyError):
             self._sockets[origin[0]].sendto(data, origin[1])
 
     def send_out(self, data: bytes, address: Address) -> str:
-        """Send a datagram that begins here. Returns why it could not be sent, or ""."""
+        """Send a datagram to another host. Returns the error, or ""."""
         problems = []
         try:
             found = socket.getaddrinfo(*address, type=socket.SOCK_DGRAM)
         except (OSError, UnicodeError) as error:
             return str(getattr(error, "strerror", error))
-        # A name may have addresses of both families while its host listens on one only, so the first of each gets it.
+        # A name may have addresses of both families while its host listens on one, so the first of each is used.
         places = {family: place for family, _, _, _, place in reversed(found) if family in self._outgoing}
         for family, place in places.items():
             try:
@@ -115,7 +115,7 @@ class StopPort:
         self, on_datagram: Callable[[bytes, Origin], Replies], on_packet: Callable[[bytes], None],
         on_turn: Callable[[], None],
     ) -> None:
-        """Hand over what arrives until the pipe closes; `on_turn` runs after each round and ten times a second."""
+        """Process datagrams and packets until the pipe closes. `on_turn` runs after each round, at least at 10 Hz."""
         while True:
             ready = self._poll.poll(_PERIOD_MS)
             for number, _ in ready:
@@ -129,13 +129,13 @@ class StopPort:
 
     def _read(self, number: int, on_datagram: Callable[[bytes, Origin], Replies]) -> None:
         one = self._sockets[number]
-        # In portions, so that the pipe is read between them whatever arrives.
+        # In portions, so that the pipe is read between them even in a flood.
         for _ in range(_AT_ONCE):
             try:
                 data, address = one.recvfrom(_LONGEST)
             except BlockingIOError:
                 return
-            except OSError:  # the report of a host that has no such port, for an earlier datagram
+            except OSError:  # the ICMP error of a host without this port, for an earlier datagram
                 continue
             for reply, origin in on_datagram(data, (number, address)):
                 self.send_to(reply, origin)
@@ -171,7 +171,7 @@ def read_arguments() -> tuple[socket.socket, dict[str, Any]]:
 
 
 STOP_SECRET_FILE: Final = "stop.secret"
-"""The secret of STOP datagrams, which robots, routers and operators share."""
+"""File of the secret of STOP datagrams, which robots, routers and operators share."""
 _SECRET_BYTES: Final = 16
 """Security limit: a shorter secret can be guessed from one recorded datagram. `sightline keys` writes 32 letters."""
 
@@ -180,7 +180,7 @@ def stop_secret_file(folder: str) -> str:
     """Return the path of the STOP secret in a folder from `sightline keys`.
 
     Raises:
-        ConfigError: the folder has no such file, as folders of earlier releases, or an invalid one.
+        ConfigError: the folder has no such file, as those of earlier releases, or an invalid one.
     """
     file = home_path(folder) / STOP_SECRET_FILE
     if not file.is_file():
@@ -191,15 +191,15 @@ def stop_secret_file(folder: str) -> str:
 
 
 def read_secret(file: str) -> bytes:
-    """Return the STOP secret in `file`, b"" for no file.
+    """Return the STOP secret in `file`, or b"" without a file.
 
     Raises:
-        ConfigError: the file is unreadable, or its secret too short. An empty one would permit every STOP.
+        ConfigError: the file is unreadable, or its secret is too short. An empty secret would permit every STOP.
     """
     if not file:
         return b""
     try:
-        with open(file, "rb") as opened:  # noqa: PTH123  without pathlib
+        with open(file, "rb") as opened:  # noqa: PTH123  pathlib takes memory
             secret = opened.read().strip()
     except OSError as error:
         raise ConfigError(f"{file}: {error.strerror}; STOP works on the link only; make it readable") from None
@@ -210,7 +210,7 @@ def read_secret(file: str) -> bytes:
     return secret
 
 
-# The side that starts such a process.
+# The process that starts a STOP process.
 
 
 _RESTART_US: Final = 1_000_000
@@ -218,36 +218,36 @@ _CHILD: Final = (
     "import sys; top = type(sys)('sightline'); top.__path__ = [sys.argv.pop(1)]; sys.modules['sightline'] = top; "
     "from sightline.{} import main; main()"
 )
-"""Without Python's site module, which takes 2 MB, only the folder of our packages is found."""
+"""It runs without Python's site module, which takes 2 MB, and finds only this package."""
 
 
 class StopProcess:
-    """A process that serves the STOP port. It ends when no process holds `near` any longer."""
+    """A process that serves the STOP port. It ends when all copies of `near` are closed."""
 
     def __init__(
         self, module: str, options: dict[str, Any], ends: tuple[socket.socket, socket.socket] | None = None
     ) -> None:
-        """Prepare it; `keep_alive` starts it.
+        """Prepare the process; `keep_alive` starts it.
 
         Args:
-            module: with a function `main`, below `sightline`.
-            options: for that function, as JSON.
-            ends: `near` and `far` of another program, which this one continues; default: a new pair.
+            module: module below `sightline` with a function `main`.
+            options: options of that function, as JSON.
+            ends: `near` and `far` of an earlier program, which this one continues; default: a new pair.
         """
         self.near, self.far = ends or socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        """`near` is the end of the process that applies a STOP. What is sent while no process reads it waits there."""
+        """`near` is the end of the process that applies a STOP. Packets wait in it until they are read."""
         self.near.setblocking(False)
         self.module, self.options = module, options
         self._process: Any = None
         self._start_at_us = 0
 
     def keep_alive(self, at_us: int) -> None:
-        """Start it if it is not there, at most once a second."""
+        """Start the process if it does not run, at most once a second."""
         if at_us < self._start_at_us:
             return
         self._start_at_us = at_us + _RESTART_US
         if self._process is None or self._process.poll() is not None:
-            # Here, because the process itself would pay for it too.
+            # Imported here, because the STOP process itself should not load them.
             import logging
             import subprocess
 
@@ -258,9 +258,9 @@ class StopProcess:
             number = self.far.fileno()
             command = [sys.executable, "-I", "-S", "-c", _CHILD.format(self.module), root, str(number)]
             command.append(json.dumps(self.options))
-            # The child inherits the mask, so no signal interrupts its imports; later it ignores them.
+            # The child inherits the mask, so that no signal interrupts its imports. Later it ignores the signals.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, _IGNORED)
-            with suppress(OSError):  # no process or descriptor is left; later there may be
+            with suppress(OSError):  # no process or descriptor is free now; the next call tries again
                 self._process = subprocess.Popen(command, pass_fds=[number], stdin=subprocess.DEVNULL)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
@@ -270,11 +270,11 @@ class StopProcess:
         return self._process.pid if self._process is not None else 0
 
     def note_end(self, status: int) -> None:
-        """Take its wait status from a caller that waits for all its children, and so for this process too."""
+        """Store the wait status that the caller received, if it waits for all its children."""
         self._process.returncode = os.waitstatus_to_exitcode(status)
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         self.near.close()
         self.far.close()
         if self._process is not None:
@@ -283,7 +283,7 @@ class StopProcess:
 
 
 def read_packets(near: socket.socket) -> Iterable[bytes]:
-    """Yield what a STOP process has sent, a bounded number of packets."""
+    """Yield the received packets of a STOP process, up to a limit."""
     for _ in range(_AT_ONCE):
         try:
             packet = near.recv(_LONGEST)
@@ -295,6 +295,6 @@ def read_packets(near: socket.socket) -> Iterable[bytes]:
 
 
 def send_packet(near: socket.socket, packet: bytes) -> None:
-    """Send a STOP process a packet, or drop it."""
+    """Send a packet to a STOP process, or drop it."""
     with suppress(OSError):
         near.send(packet)

@@ -2,11 +2,11 @@
 
     sightline-token/robot/ROBOT                            a robot
     sightline-token/vision/NAME/WEIGHT/INSTANCE            a vision service that shares robots
-    sightline-token/driver/ROBOT/NAME/TOKEN                a session of it that drives a robot, or is about to
+    sightline-token/driver/ROBOT/NAME/TOKEN                a session of it that drives a robot, or soon will
     sightline-token/detector/GROUP/WEIGHT/SESSION/ROBOTS   a detector service that shares robots
 
-A token ends some milliseconds after its process, or with its link. `TOKEN` follows from the first proof of the
-driver (`protocol/proof.py`): only the driver can compute it before, so a robot knows whose token it is.
+A token ends some milliseconds after its process, or with its link. `TOKEN` follows from the first proof of the driver
+(`protocol/proof.py`). Only the driver can compute it before, so a robot knows the owner of a token.
 """
 
 import re
@@ -19,13 +19,13 @@ ROBOT_KIND, VISION_KIND, DRIVER_KIND, DETECTOR_KIND = "robot", "vision", "driver
 ALL_TOKENS: Final = f"{PREFIX}/**"
 LEAST_WEIGHT, MOST_WEIGHT = 0.01, 1000.0
 
-# Security limits: robots and vision services of a site whose tokens one peer stores.
+# Security limits: robots and vision services whose tokens one peer stores.
 MAX_ROBOTS: Final = 10_000
 MAX_SERVICES: Final = 256
 RECALL_US: Final = 5_000_000
-"""Time in which a second watch has reported the tokens of before, also on a busy machine."""
+"""Time in which a second watch has reported all earlier tokens, also on a busy machine."""
 _WEIGHT: Final = r"\d{1,4}(?:\.\d{1,3})?"
-# Exact: a peer may declare a token with a wildcard, which names no robot and no service.
+# Exact, because a peer may declare a token with a wildcard, which names no robot and no service.
 _KEYS: Final = re.compile(
     rf"{PREFIX}/(?:robot/(?P<robot>{NAME_PATTERN})"
     rf"|vision/(?P<name>{NAME_PATTERN})/(?P<weight>{_WEIGHT})/(?P<instance>[0-9a-f]{{8}})"
@@ -34,12 +34,12 @@ _KEYS: Final = re.compile(
     r"/(?P<pattern>[A-Za-z0-9_.+=-]{1,32}))",
     re.ASCII,
 )
-# A key of a token has no wildcards, so a pattern of robots has `+` and `=` for them there.
+# The key of a token has no wildcards, so `+` and `=` replace them in a pattern of robots.
 _TO_KEY, _FROM_KEY = str.maketrans("*?", "+="), str.maketrans("+=", "*?")
 
 
 def _weight(weight: float) -> str:
-    """Format a weight for a key: three decimals of at most 1000 are seven digits."""
+    """Format a weight for a key: three decimals, at most 1000, so seven digits."""
     return f"{weight:.7g}"
 
 
@@ -55,12 +55,12 @@ class RobotToken(NamedTuple):
 
 
 class VisionToken(NamedTuple):
-    """A vision service is present and shares robots. `weight` is its share of them, relative to the other services."""
+    """A vision service is present and shares robots. `weight` is its share, relative to the other services."""
 
     name: str
     weight: float
     instance: str
-    """8 hex digits drawn at the start: two services with one name differ in it."""
+    """8 random hex digits of this start, which distinguish two services with one name."""
 
     @property
     def key(self) -> str:
@@ -69,7 +69,7 @@ class VisionToken(NamedTuple):
 
 
 class DriverToken(NamedTuple):
-    """A session of the vision service `name` drives `robot`, or is about to."""
+    """A session of the vision service `name` drives `robot`, or soon will."""
 
     robot: str
     name: str
@@ -82,14 +82,14 @@ class DriverToken(NamedTuple):
 
 
 class DetectorToken(NamedTuple):
-    """A detector service is present and shares robots with those of its group."""
+    """A detector service is present and shares robots with the services of its group."""
 
     group: str
-    """8 hex digits, equal for services that can do each other's work."""
+    """8 hex digits, equal for services that can replace each other."""
     weight: float
-    """Its share of them, relative to the other services, with at most three decimals."""
+    """Its share of the robots, relative to the other services, with at most three decimals."""
     session: str
-    """The session of its answers."""
+    """The session in the headers of its answers."""
     robots: str = "*"
     """Pattern of the robots that it serves, with `*` and `?`."""
 
@@ -115,7 +115,7 @@ def detectors_of(group: str) -> str:
 
 
 def parse_token(key: str) -> AnyToken | None:
-    """Parse the exact key of a token. Return None for any other text, also for a weight out of bounds."""
+    """Parse the exact key of a token. Return None for any other text, also for a weight outside its limits."""
     parts = _KEYS.fullmatch(key)
     if parts is None:
         return None
@@ -132,26 +132,26 @@ def parse_token(key: str) -> AnyToken | None:
 
 
 class SecondWatch:
-    """Which tokens count that a second watch reports, after a flood in which some of the first one found no room.
+    """Selects the valid tokens of a second watch, after a flood in which some tokens of the first one found no room.
 
-    Zenoh may report a token there after the first watch reported its end. `on_end` and `counts` from any thread.
+    Zenoh may report a token there after the first watch reported its end. `on_end` and `counts` are thread-safe.
     """
 
     def __init__(self, most_ends: int) -> None:
-        """Create it. `most_ends` is a security limit: ends that are stored."""
+        """Create it. `most_ends` is a security limit for the number of stored ends."""
         self._most_ends, self._until_us = most_ends, 0
         self._ended: set[AnyToken] | None = None
 
     def begin(self, now_us: int) -> None:
-        """Note that the second watch begins."""
+        """Note the start of the second watch."""
         self._until_us, self._ended = now_us + RECALL_US, set()
 
     def end(self) -> None:
-        """Count nothing more that it reports."""
+        """Ignore all later tokens of the second watch."""
         self._ended = None
 
     def is_on(self, now_us: int) -> bool:
-        """Return True while it reports the tokens of before."""
+        """Return True while the second watch reports the earlier tokens."""
         if now_us >= self._until_us:
             self._ended = None
         return self._ended is not None
@@ -165,6 +165,6 @@ class SecondWatch:
         return True
 
     def counts(self, token: AnyToken) -> bool:
-        """Return True if a token that the second watch reports is there."""
+        """Return True if a token of the second watch is still present."""
         ended = self._ended
         return ended is not None and token not in ended

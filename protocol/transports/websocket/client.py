@@ -1,4 +1,4 @@
-"""The connecting end: connects to one endpoint, and again after a loss. Shell."""
+"""The connecting end: connects to one endpoint, and reconnects after a loss. Shell."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 FIRST_PAUSE_S: Final = 0.2
 LONGEST_PAUSE_S: Final = 1.0
 PAUSE_GROWTH: Final = 1.5
-# By the code of OpenSSL.
+# Advice by the verification code of OpenSSL.
 _FIXES: Final = {
     9: "set the clock of this machine",  # X509_V_ERR_CERT_NOT_YET_VALID
     10: "make new keys, or set the clock of this machine",  # X509_V_ERR_CERT_HAS_EXPIRED
@@ -32,7 +32,7 @@ _FIXES: Final = {
 
 
 class Client:
-    """Keeps one connection to `endpoint` until closed."""
+    """Maintains one connection to `endpoint` until closed."""
 
     def __init__(
         self,
@@ -46,7 +46,7 @@ class Client:
 
         Args:
             endpoint: the endpoint.
-            serve: called for each connection until it is gone; it raises PeerError to drop the connection.
+            serve: serves one connection until it is gone; it raises PeerError to drop the connection.
             count_rejection: counts a rejection by its reason.
             keys: folder with the token and the trusted authority of this end, and the role of the link.
             max_bytes: security limit for a message that comes with the answer to the handshake.
@@ -61,9 +61,9 @@ class Client:
         self._serve, self._count_rejection, self._max_bytes = serve, count_rejection, max_bytes
         self._closing = threading.Event()
         self.trouble = ""
-        """Cause of the last failure, for the operator. Empty without an answer."""
+        """Cause of the last failure, for the operator. Empty before the first answer."""
         self.turned_away = threading.Event()
-        """Set when a peer answered and rejects this end for good."""
+        """Set when a peer has answered and rejects this end permanently."""
         threading.Thread(target=self._run, name="websocket-dial", daemon=True).start()
 
     def close(self) -> None:
@@ -75,8 +75,8 @@ class Client:
         while not self._closing.is_set():
             if self._connect():
                 pause_s = FIRST_PAUSE_S
-            # A short first pause, because most losses are a restart of the robot. A longer one later, so that many
-            # clients do not flood a robot that starts.
+            # The first pause is short, because most losses are a restart of the robot. Later ones are longer, so that
+            # many clients do not flood a robot that starts.
             self._closing.wait(pause_s)
             pause_s = min(LONGEST_PAUSE_S, pause_s * PAUSE_GROWTH)
 
@@ -108,13 +108,13 @@ class Client:
             self._turned_away(f"no TLS: {why}; {fix}", True)
         except OSError:  # no listener, or no answer in time
             self.trouble = ""
-        # A broken peer can make the library raise any error. This thread must continue.
+        # A broken peer can cause any error in the library. This thread must continue.
         except Exception as error:
             self._turned_away(f"{type(error).__name__}: {report_fault('websocket', error)}"[:200], False)
         return False
 
     def _missing_token(self, status: int) -> str:
-        """Return which file of the own folder is missing, if a peer that requires a token answers with `status`."""
+        """Return the missing file of this end's folder, if a peer that requires a token answers with `status`."""
         folder, source = self._keys
         if status != 401 or not folder or self._token:
             return ""
@@ -145,7 +145,7 @@ class Client:
             **PROTOCOL_OPTIONS,
         )
         request = protocol.connect()
-        # In a header and not in the address, because proxies and servers log addresses.
+        # In a header, not in the address, because proxies and servers log addresses.
         if self._token:
             request.headers["Authorization"] = bearer_header(self._token)
         protocol.send_request(request)
@@ -164,7 +164,7 @@ class Client:
         except PeerError as error:
             self._count_rejection(error.counted)
             wire.close(error.code, str(error))
-            # Without the wait, a reset of the connection could overtake the reason.
+            # Without this wait, a reset of the connection could overtake the reason.
             wire.linger()
             raise
         finally:
@@ -178,5 +178,5 @@ class Client:
 
 def _is_final(closed: ConnectionClosed) -> bool:
     """Return True if another attempt is useless."""
-    # 1000 and 1001: the peer ends or restarts. 1013: it has no free place now. Both can change.
+    # 1000 and 1001: the peer ends or restarts. 1013: it has no free place now. These can change.
     return closed.rcvd is not None and closed.rcvd.code not in (1000, 1001, 1013)

@@ -33,7 +33,7 @@ PING_EVERY_US: Final = 1_000_000
 SILENCE_US: Final = 2_000_000
 # Limit for a full send path without progress, e.g. to a stopped process. It costs one socket buffer and a place.
 STALLED_LIMIT_US: Final = 30_000_000
-# Silence after which the send path is observed.
+# Silence after which the send path is checked.
 _LOOK_AFTER_US: Final = 500_000
 _LONG_AGO_US: Final = -(10**12)
 
@@ -43,15 +43,15 @@ class SendPath:
     """The state of the path to the other end."""
 
     full: bool
-    """Data waits here, or may wait unread at the other end, which reads slowly or not at all."""
+    """True if data waits here, or may wait unread at the other end, which reads slowly or not at all."""
     taken_bytes: int
     """Bytes that the other machine has acknowledged so far."""
     lost: bool
-    """Data is in flight, and the other machine has acknowledged nothing for `SILENCE_US`."""
+    """True if data is in flight and the other machine has acknowledged nothing for `SILENCE_US`."""
 
 
 class Keepalive:
-    """Decides on pings and on the end of one connection. It reads the send path only of a silent peer."""
+    """Decides about pings and the end of one connection. It reads the send path only of a silent peer."""
 
     def __init__(self, now_us: int) -> None:
         self._received_us = self._pinged_us = self._taken_us = now_us
@@ -70,7 +70,7 @@ class Keepalive:
         return due
 
     def is_over(self, now_us: int, look: Callable[[], SendPath]) -> bool:
-        """Return True if the connection has to end.
+        """Return True if the connection must end.
 
         Args:
             now_us: monotonic clock.
@@ -85,16 +85,16 @@ class Keepalive:
             self._full_us = now_us
         if now_us - self._received_us < SILENCE_US:
             return False
-        # A reader with a full send path gets no chance to answer a ping in time. It is slow, not gone.
+        # A reader with a full send path cannot answer a ping in time. It is slow, not gone.
         is_slow = now_us - self._full_us < SILENCE_US
         return way.lost or not is_slow or now_us - max(self._received_us, self._taken_us) >= STALLED_LIMIT_US
 
 
-# The kernel's state of a TCP send path (Linux; elsewhere only the data that still waits here). Shell.
+# The kernel's state of a TCP send path (Linux; on other systems only the data that still waits here). Shell.
 
 
 class _Fields(NamedTuple):
-    """Fields of `struct tcp_info` in linux/tcp.h, which keep their positions."""
+    """Fields of `struct tcp_info` in linux/tcp.h, whose positions never change."""
 
     probes: int
     unacked_packets: int
@@ -113,7 +113,7 @@ def send_path(near: socket.socket, full: bool) -> SendPath:
         return SendPath(full, 0, False)
     try:
         fields = _Fields(*_LAYOUT.unpack(near.getsockopt(socket.IPPROTO_TCP, _OPTION, _LAYOUT.size)))
-    except (OSError, struct.error):  # closed, or an older kernel
+    except (OSError, struct.error):  # the socket is closed, or the kernel is older
         return SendPath(full, 0, False)
     # A machine with a slow reader still answers a probe of its full window. Two probes without an answer mean a loss.
     is_requested = fields.unacked_packets > 0 or fields.probes >= 2
@@ -123,14 +123,14 @@ def send_path(near: socket.socket, full: bool) -> SendPath:
 
 # Messages from the bytes of a connection, and back. Shell (the library).
 #
-# `websockets` reads and writes every kind of frame. Most messages arrive in one piece and one frame, or leave unmasked.
-# The direct path for them avoids four copies of each image.
+# `websockets` can read and write every kind of frame. Most messages arrive as one piece and one frame, or leave
+# unmasked. A direct path for them avoids four copies of each image.
 
 
 if TYPE_CHECKING:
     Received = str | bytes | Request | Response
 
-# Security limit: pieces of one message; their bytes are bounded by the protocol.
+# Security limit: pieces of one message. The protocol limits their bytes.
 MAX_FRAGMENTS: Final = 1024
 
 _TEXT, _BINARY, _FIN, _MASK = 0x01, 0x02, 0x80, 0x80  # RFC 6455, 5.2
@@ -138,7 +138,7 @@ _SHORT, _LONG = 126, 127
 
 
 class MessageReader:
-    """Collects whole messages of one connection until the reader takes them."""
+    """Collects complete messages of one connection until the reader takes them."""
 
     def __init__(self, protocol: Protocol) -> None:
         from websockets.frames import Frame, Opcode
@@ -154,7 +154,7 @@ class MessageReader:
         self._messages = (Opcode.TEXT, Opcode.BINARY, Opcode.CONT)
 
     def feed(self, data: bytes) -> None:
-        """Take received bytes. Afterwards the protocol may have data to send."""
+        """Process received bytes. Afterwards the protocol may have data to send."""
         if not self._is_masked and self._is_at_start() and (at := _start_of_only(data, self._bound())):
             self._put(data[at:], data[0] == _FIN | _TEXT)
             return
@@ -193,7 +193,7 @@ class MessageReader:
         try:
             self.ready.append(data.decode() if is_text else data)
         except UnicodeDecodeError as error:
-            # Later messages of the same bytes are already parsed, and must not pass.
+            # Later messages in the same bytes are already parsed, and must not be delivered.
             self._is_broken = True
             self._protocol.fail(1007, f"{error.reason} at position {error.start}")
 
@@ -216,20 +216,20 @@ def unmasked_head(size: int, is_text: bool) -> bytes:
     return struct.pack("!BBH", first, _SHORT, size) if size < 1 << 16 else struct.pack("!BBQ", first, _LONG, size)
 
 
-# The connection: a socket that never blocks, with the protocol of `websockets`. Shell (sockets).
+# The connection: a non-blocking socket with the protocol of `websockets`. Shell (sockets).
 #
 # One thread reads and waits; any thread may send. A new message goes to the socket only if it has room. Otherwise it
 # waits in the queue of the peer, where a newer message can replace it, and the thread continues to read.
 
 
-# Security limit: a connection that is closing is cut off after this.
+# Security limit: time after which a closing connection is cut off.
 CLOSE_S: Final = 1.0
 _CHUNK_BYTES: Final = 65_536
-# For small messages. A flood of them must not become one large batch of objects.
+# For small messages, so that a flood of them does not become one large batch of objects.
 _SMALL_CHUNK_BYTES: Final = 4_096
-# Sent since the last data from the other end. So much may wait unread before the ping.
+# Bytes sent since the last data from the other end. This amount may wait unread before the ping.
 _MUCH_BYTES: Final = 32_768
-# Security limit: waiting pieces, e.g. pongs, before reading stops.
+# Security limit: waiting pieces, e.g. pongs, at which reading stops.
 _MAX_UNSENT: Final = 12
 _MAX_REASON_BYTES: Final = 123  # RFC 6455, 5.5
 _NOT_NOW: Final = (BlockingIOError, InterruptedError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
@@ -242,12 +242,12 @@ class Connection:
         from websockets.protocol import SERVER, State
 
         near.setblocking(False)
-        # A twist is one small packet. With Nagle's algorithm it would wait for the acknowledgment of the packet before.
+        # With Nagle's algorithm, a small packet such as a twist would wait for the last acknowledgment.
         near.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.protocol = protocol
         self.lock = threading.Lock()
         self.granted: frozenset[tuple[str, ...]] | None = None
-        """(channel, source) pairs that the other end may publish, None for all. Set with the check of its token."""
+        """(channel, source) pairs that the other end may publish, None for all. Set by the check of its token."""
         self.received_us = heartbeat_us()
         """Time of the last data from the other end."""
         self._unheard_bytes = 0
@@ -283,8 +283,8 @@ class Connection:
         if events != self._awaited:
             self._readable.register(self._near, events)
             self._awaited = events
-        # TLS decrypts whole records, so data can wait in this process while the socket has none for `poll`.
-        # While nothing is read they stay there, and only room for what waits ends the wait.
+        # TLS decrypts whole records, so data can wait in this process while `poll` sees none in the socket. While
+        # reading is stopped it stays there, and only room for waiting data ends the wait.
         if events & select.POLLIN and isinstance(self._near, ssl.SSLSocket) and self._near.pending():
             return
         for descriptor, event in self._readable.poll(timeout_s * 1000):
@@ -401,7 +401,7 @@ class Connection:
 
     def linger(self) -> None:
         """Discard further data until the connection has ended."""
-        # A close with unread data sends a reset, and the other end would lose the reason.
+        # Closing with unread data sends a reset, and the other end would lose the reason.
         from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
         with suppress(ConnectionClosed, InvalidHandshake):
@@ -412,13 +412,13 @@ class Connection:
     def shut(self) -> None:
         """Close the sockets."""
         with self.lock:
-            # Another socket may get the same descriptor number. This connection must not poll it.
+            # Another socket may get the same descriptor number, which this connection must not poll.
             self._is_shut = True
             for end in (self._near, self._alarm, self._bell):
                 end.close()
 
     def _frame(self, pieces: Sequence[bytes], is_text: bool) -> None:
-        # The reading end reports how a closing connection ended.
+        # The reading thread reports how a closing connection ended.
         if self.protocol.state is not self._open:
             return
         if self._is_server:
@@ -431,7 +431,7 @@ class Connection:
         return not (self._unsent or self._wants_room or self._is_shut) and bool(self._room.poll(0))
 
     def _flush(self) -> None:
-        """Pass pending data of the protocol to the socket, as far as it has room."""
+        """Pass pending data of the protocol to the socket, while it has room."""
         self._unsent.extend(_joined(self.protocol.data_to_send()))
         if self._cut_off_s is None and self.protocol.close_expected():
             self._cut_off_s = time.monotonic() + CLOSE_S
@@ -440,12 +440,12 @@ class Connection:
                 pass
         except _NOT_NOW:
             return
-        except OSError:  # gone: the reading end sees it too
+        except OSError:  # the connection is gone; the reading thread detects it, too
             self._unsent.clear()
 
     def _send_some(self) -> bool:
         """Send one batch. Returns True if the socket accepted all of it."""
-        if not self._unsent[0]:  # the protocol's sign for the end
+        if not self._unsent[0]:  # an empty piece marks the end of the data
             self._near.shutdown(socket.SHUT_WR)
             self._unsent.popleft()
             return True
@@ -465,12 +465,12 @@ class Connection:
         return True
 
     def _ring(self) -> None:
-        with suppress(OSError):  # closed, or rung often enough
+        with suppress(OSError):  # the bell is closed, or its buffer is full
             self._bell.send(b"!", socket.MSG_DONTWAIT)
 
 
 def _joined(writes: Sequence[bytes]) -> list[bytes]:
-    """Join small pieces into one. The empty piece, which marks the end, stays separate."""
+    """Join small pieces into one. An empty piece, which marks the end, stays separate."""
     if len(writes) < 2:
         return list(writes)
     text = b"".join(writes)

@@ -2,8 +2,8 @@
 
     uint16 BE length of the header block | header block | payload
 
-The header block is the header of the message, a JSON object, with `"channel"` as its first field. An empty header, one
-that is not an object with fields, or one that names no source or another follows a separate object:
+The header block is the header of the message, a JSON object, with `"channel"` as its first field. A separate object
+precedes a header that is empty, is not an object with fields, or does not name the source of the message:
 `{"channel":"twist","source":"guest"}`.
 """
 
@@ -22,7 +22,7 @@ from sightline.protocol.messages import RobotId, SessionId, Version, WireModel
 from sightline.protocol.transports.link import Message
 
 SUBPROTOCOL: Final = "sightline.v1"
-# Security limit: a header with the names before it.
+# Security limit: a header with the added names.
 MAX_BLOCK_BYTES: Final = MAX_HEADER_BYTES + 64
 # Security limit: the text of a hello. Every peer must accept a message of this size.
 MAX_HELLO_BYTES: Final = 1024
@@ -34,7 +34,8 @@ _ALONE: Final = re.compile(rb'\{"channel":"([^"\\]{1,64})"(?:,"source":"([^"\\]{
 
 
 class Hello(WireModel):
-    """Names a peer and the channels that it wants. It is the first message each way. A change of `wants` repeats it."""
+    """Names a peer and its wanted channels. It is the first message in each direction. A change of `wants` repeats it.
+    """
 
     v: Version = VERSION
     robot: RobotId = Field(description="the robot's id; from a connecting peer the robot that it requests")
@@ -50,7 +51,7 @@ class Hello(WireModel):
 
 
 class IncomingMessage(NamedTuple):
-    """A message from the wire. The key contains the claims of the peer and is not checked yet."""
+    """A message from the wire. The key contains unchecked claims of the peer."""
 
     key: str
     header: bytes
@@ -68,7 +69,7 @@ def pack(channel: Channel, source: str, role: str, header: bytes, payload: bytes
     Args:
         channel: the channel.
         source: source of the message, or "" from a robot.
-        role: role in the hello of this end, the source of a message whose header names none.
+        role: role in the hello of this end: the source of a message whose header names none.
         header: encoded header, may be empty.
         payload: encoded payload.
 
@@ -80,7 +81,7 @@ def pack(channel: Channel, source: str, role: str, header: bytes, payload: bytes
 
 def pack_pieces(channel: Channel, source: str, role: str, header: bytes, payload: bytes) -> tuple[bytes, bytes]:
     """Pack a message in two pieces. The second is `payload` itself, which avoids a copy of the image."""
-    # Parsed only for what is passed on: of its own messages this end knows the source.
+    # Parsed only for a forwarded message, because the source of own messages is known.
     if header[:2] == b'{"' and (source in ("", role) or _fields(header).get("source") == source):
         block = b'{"channel":"%b",%b' % (channel.name.encode("ascii"), header[1:])
     else:
@@ -95,7 +96,7 @@ def unpack(message: bytes, robot: str, role: str) -> IncomingMessage:
     Args:
         message: one binary WebSocket message.
         robot: robot id of its hello.
-        role: role of its hello, the source of a message whose header names none.
+        role: role of its hello: the source of a message whose header names none.
 
     Raises:
         WireError: MALFORMED for broken framing.
@@ -109,7 +110,7 @@ def unpack(message: bytes, robot: str, role: str) -> IncomingMessage:
         source = role if alone[2] is None else alone[2].decode("utf-8", "replace")
         return IncomingMessage(_key(robot, alone[1].decode("utf-8", "replace"), source), block[alone.end() :], payload)
     first = _FIRST.match(block)
-    if first is not None and first[1] in _WITHOUT_SOURCE:  # frames, the most bytes of a link, need no JSON parser here
+    if first is not None and first[1] in _WITHOUT_SOURCE:  # frames are most of the bytes, and need no JSON parser here
         return IncomingMessage(_key(robot, first[1].decode("ascii"), ""), b"{" + block[first.end() :], payload)
     fields = _fields(block)
     name = fields.get("channel") if first is None else first[1].decode("utf-8", "replace")
@@ -137,15 +138,15 @@ def _key(robot: str, name: str, source: str) -> str:
 
 # The codec of one WebSocket peer: the interface, and `sightline.v1`. Pure.
 #
-# A codec converts publications to messages, and messages to packets. It knows neither the order of sending nor the
+# A codec converts publications to messages, and messages to packets. It does not know the order of sending or the
 # socket.
 
 
-# Counted for a first message, or a later text, that is not a hello.
+# Counter of first messages, or later texts, that are not a hello.
 BAD_HELLO: Final = "BAD_HELLO"
-# Counted for a hello that names another robot.
+# Counter of hellos that name another robot.
 OTHER_ROBOT: Final = "OTHER_ROBOT"
-# Counted for a message of the wrong kind, or with broken framing.
+# Counter of messages of the wrong kind, or with broken framing.
 BAD_FRAMING: Final = "BAD_FRAMING"
 
 
@@ -205,9 +206,9 @@ class PeerCodec(Protocol):
 
 
 class SightlineV1:
-    """Speaks `sightline.v1` with a peer of `robot`. `role` is the local one. A peer wants nothing until its hello.
+    """Codec of `sightline.v1` for a peer of `robot`. `role` is the local role. Before its hello a peer wants nothing.
 
-    `connects` is True at the end that connected.
+    `connects` is True at the connecting end.
     """
 
     text = False
@@ -247,14 +248,14 @@ class SightlineV1:
         return max(MAX_HELLO_BYTES, 2 + MAX_BLOCK_BYTES + wanted_bytes)
 
     def accept(self, text: str) -> None:
-        """Take the hello of the peer. Raises PeerError for an invalid one, and for another robot."""
+        """Process the hello of the peer. Raises PeerError for an invalid hello, and for another robot."""
         try:
             hello = parse_hello(text)
         except WireError as error:
             raise PeerError(BAD_HELLO, 1008, f"invalid hello: {error.detail}") from None
         if hello.robot != self._robot:
-            # A listening end describes itself to the other one. An end that connected describes what it found, because
-            # its own operator reads the text.
+            # A listening end describes itself to the other end. A connecting end describes the peer, because its own
+            # operator reads the text.
             text = f"this is robot {self._robot}, not {hello.robot}"
             if self._connects:
                 text = f"the robot there is {hello.robot}, not {self._robot}"

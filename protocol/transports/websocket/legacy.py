@@ -1,6 +1,6 @@
-"""Implement the legacy protocol as a peer codec, at both ends, with the one slot of its driver. Pure.
+"""Implement the legacy protocol as a peer codec, at both ends, with one slot for the driver. Pure.
 
-All its clients are the same `guest` to the robot. Without the slot, the robot would mix the commands of two clients.
+All its clients have the source `guest`. Without the slot, the robot would mix the commands of two clients.
 """
 
 from collections.abc import Callable, Hashable
@@ -33,7 +33,7 @@ DRIVER_SLOT_US: Final = 1_000_000
 
 
 class DriverSlot:
-    """The slot of the one driver of a link."""
+    """The slot of the single driver of a link."""
 
     def __init__(self) -> None:
         self._driver = ""
@@ -59,7 +59,7 @@ MAX_COMMAND_TEXT_BYTES: Final = 256
 
 
 class LegacyClient(NamedTuple):
-    """A client of the legacy protocol, with the slot that it shares with others, and the writer of log lines."""
+    """A client of the legacy protocol, the slot that it shares with others, and the writer of log lines."""
 
     who: str
     driver_slot: DriverSlot
@@ -97,7 +97,7 @@ class LegacyToVision:
 
     def note_sent(self, message: Message) -> None:
         self._sent = message.header, self._now_us()
-        # The peer may have examined any image since its last answer. The oldest one never makes the answer too young.
+        # The peer may have used any image since its last answer. With the oldest one the answer is never too young.
         if self._looked_at is None:
             self._looked_at = message.header, message.payload
 
@@ -117,7 +117,8 @@ class LegacyToVision:
         self._driver_slot.leave(self._who)
 
     def _twist(self, text: bytes) -> IncomingMessage:
-        """Convert a twist. Other text stays unchanged: the robot rejects it, and shows the reason in `status`."""
+        """Convert a twist. Other text stays unchanged, so that the robot rejects it and shows the reason in `status`.
+        """
         try:
             twist = parse_dashed(text, self._options.swapped) if self._options.dashed else parse_twist(text)
         except WireError:
@@ -163,7 +164,7 @@ class LegacyToVision:
 
 
 def _echo(header: bytes) -> Echo | None:
-    """Cite the frame of `header`. Returns None for a frame without a header."""
+    """Return the echo of the frame with `header`, or None for a frame without a header."""
     try:
         frame = decode(FrameHeader, header)
     except WireError:
@@ -171,9 +172,9 @@ def _echo(header: bytes) -> Echo | None:
     return Echo.of(frame)
 
 
-# A legacy robot without a newer command for this long is brought to rest. Equal to the silence that a robot permits.
+# Time without a newer command after which a legacy robot is stopped. Equal to the silence that a robot permits.
 SILENCE_US: Final = 300_000
-# A connection that ends so soon after a text was probably closed because of it.
+# A connection that ends within this time after a text was probably closed because of the text.
 CLOSED_BY_TEXT_US: Final = 100_000
 CLOSED_BY_TEXT: Final = 3
 # Zeros after each motion.
@@ -181,13 +182,13 @@ _ZEROS: Final = 2
 
 
 class LegacyCommands:
-    """The commands that one legacy robot received, over all connections. Two zeros follow each motion.
+    """The commands to one legacy robot, over all connections. Two zeros follow each motion.
 
-    Such a robot has no watchdog: it applies its last command for ever.
+    Such a robot has no watchdog: it applies its last command forever.
     """
 
     def __init__(self, endpoint: str, options: LegacyOptions, log: Callable[[str], None]) -> None:
-        """Create the record for the robot at `endpoint`. `tell` writes a log line."""
+        """Create the record for the robot at `endpoint`. `log` writes a log line."""
         self._endpoint, self.options, self._log = endpoint, options, log
         self.zero = b"" if options.boxes else as_text(options, b"0.0000|0.0000")
         """The text that stops the robot."""
@@ -208,17 +209,17 @@ class LegacyCommands:
         self._zeros = self._zeros + 1 if text == self.zero else 0
 
     def rest_due(self, now_us: int) -> bool:
-        """Return True if a zero is due: the second after a first, or the first after silence or a lost connection."""
+        """Return True if a zero is due: the second one, or the first one after a silence or a lost connection."""
         if self._last is None or self._zeros >= _ZEROS:
             return False
         return self._zeros > 0 or now_us - self._last_us > SILENCE_US
 
     def farewell(self) -> tuple[bytes, ...]:
-        """Return the last texts of a link that ends, none if it never sent a command."""
+        """Return the last texts of a link that ends; empty if it never sent a command."""
         return () if self._last is None else (self.zero,) * _ZEROS
 
     def closed(self, now_us: int) -> None:
-        """Note that a connection ended. Logs a text format that the robot may be able to read."""
+        """Note the end of a connection. It may log a text format that the robot could read."""
         last = self._last
         if last is None:
             return
@@ -229,11 +230,11 @@ class LegacyCommands:
                 f"robot at {self._endpoint} closed {CLOSED_BY_TEXT} connections within {CLOSED_BY_TEXT_US // 1000} ms "
                 f"after '{last.decode('ascii')}'; use the text format that it reads, probably {self._alternative(last)}"
             )
-        # The robot may still apply its last command. Zero is due as soon as it is connected again.
+        # The robot may still apply its last command. Zero is due immediately after the next connection.
         self._zeros, self._last_us = 0, now_us - SILENCE_US - 1
 
     def _alternative(self, last: bytes) -> str:
-        """Return the endpoint with the format that avoids the end of the connection after `last`."""
+        """Return the endpoint with a format that the robot may accept in place of `last`."""
         options, address = self.options, self._endpoint.partition("?")[0]
         if options.boxes or not options.dashed:
             return address if options.boxes else f"{address}?dashed"
@@ -244,14 +245,14 @@ class LegacyCommands:
 
 
 def as_text(options: LegacyOptions, twist: bytes) -> bytes:
-    """Write the text of a twist in the format of `options`."""
+    """Format the text of a twist by `options`."""
     return format_dashed(twist, options.swapped, options.nonnegative) if options.dashed else twist
 
 
 class LegacyToRobot:
-    """The vision service's end of the legacy protocol: base64 text in as frames, twists out as bare text.
+    """The vision service's end of the legacy protocol: base64 text in as frames, twists out as plain text.
 
-    The codec creates the header of a frame. Its session stands for this connection, and `t_us` is the arrival time on
+    The codec creates the header of a frame. Its session is that of this connection, and `t_us` is the arrival time on
     the clock of this machine. The motion of the robot is unknown.
     """
 

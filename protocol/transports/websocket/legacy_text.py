@@ -2,10 +2,10 @@
 
 image     base64 of the JPEG, a newline after every 76 characters and at the end
 twist     `linear|angular`, as in `sightline.protocol.text`
-dashed    `linear-angular`, opt-in; swapped, another option, `angular-linear`: as the legacy robot read the two.
-          A legacy robot splits it at each `-`, so that it cannot read a negative number
+dashed    `linear-angular`, opt-in. With the option swapped `angular-linear`, the order of the legacy robot.
+          A legacy robot splits it at each `-`, so it cannot read a negative number
 boxes     `y_min,x_min,y_max,x_max` or `class,x_min,y_min,x_max,y_max`, joined by `-`, opt-in: fractions of the
-          image's height and width; in both, a reader of the legacy protocol finds x in the 2nd and 4th field
+          image's height and width. In both forms, a legacy reader finds x in the 2nd and 4th field
 """
 
 import binascii
@@ -121,7 +121,7 @@ def format_dashed(twist: bytes, swapped: bool, nonnegative: bool) -> bytes:
 
 
 def boxes_from_detections(found: Detections) -> tuple[LegacyBox, ...]:
-    """Convert boxes in pixels to fractions of the image, without labels. The best 16, cut to the image."""
+    """Convert boxes in pixels to fractions of the image, without labels: the best 16, clipped to the image."""
     def share(px: float, whole_px: int) -> float:
         return min(1.0, max(0.0, px / whole_px))
 

@@ -1,6 +1,6 @@
-"""Implement `Link` on WebSocket: subscriptions, peers, and what a listening end passes on. Shell.
+"""Implement `Link` on WebSocket: subscriptions, peers, and the forwarding at a listening end. Shell.
 
-A link announces the channels that it subscribed to. A listening end also announces overlays while a peer watches them.
+A link announces its subscribed channels. A listening end also announces overlays while a peer watches them.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class Subscriptions:
 
     def announce(self, peers: Sequence[Subscriber], passing_on: bool) -> None:
         """Announce a changed list of channels to all `peers`. `passing_on` is True at a listening end."""
-        # A listening end subscribes to an overlay only while another peer wants it. It saves the encoding otherwise.
+        # A listening end subscribes to an overlay only while another peer wants it, to save the encoding.
         watched = (one.name for one in _WATCHED if passing_on and any(peer.subscribes_to(one) for peer in peers))
         names = tuple(dict.fromkeys((*self._callbacks, *watched)))
         if names != self.announced:
@@ -114,10 +114,10 @@ class Subscriptions:
 #     with open_websocket("r1", listen="ws://127.0.0.1:9090") as link:
 #         link.publish(STATUS, header, payload)
 #
-# Only the channels that the table marks as passed on go from peer to peer.
+# A message goes from peer to peer only on the channels that the table marks as forwarded.
 
 
-# A close that takes longer is left to daemon threads, so that no process hangs on a dead peer.
+# Time limit of a close. A longer one continues on daemon threads, so that no process hangs on a dead peer.
 CLOSE_S: Final = 1.5
 
 
@@ -133,7 +133,7 @@ def open_websocket(
 ) -> WebSocketLink:
     """Open a link to `robot`; use it in a `with`.
 
-    A listening end connects to `connect` in the background. A lost connection is restored automatically.
+    A listening end connects to `connect` in the background. It reconnects after a loss.
 
     Args:
         robot: robot id.
@@ -175,10 +175,10 @@ class WebSocketLink(BaseLink):
     """A `Link` over any number of WebSocket connections. It does not receive its own publications."""
 
     def __init__(self, rules: LinkRules) -> None:
-        """Use `open_websocket` in place of this constructor."""
+        """Use `open_websocket` instead of this constructor."""
         super().__init__(rules)
         self._subscriptions = Subscriptions(rules, secrets.token_hex(4))
-        # The driver comes first. The tuple is replaced and never changed, so that publishing needs no lock.
+        # The driver is first. The tuple is replaced, never changed, so that publishing needs no lock.
         self._peers: tuple[Peer, ...] = ()
         self._joining = threading.Lock()
         self._joined = threading.Event()
@@ -241,7 +241,7 @@ class WebSocketLink(BaseLink):
         for listener in self._listeners:
             listener.close(reason)
         deadline_s = time.monotonic() + CLOSE_S
-        # The peer that runs a callback waits for its end, so that callback must not wait for the peer.
+        # A peer waits for the end of its callback, so that callback must not wait for the peer.
         for peer in () if getattr(self._in_callback, "now", False) else peers:
             peer.wait_gone(max(0.0, deadline_s - time.monotonic()))
 
@@ -254,7 +254,7 @@ class WebSocketLink(BaseLink):
             self._listeners.append(Server(end, partial(self._serve, end), reject, self._log_line, keys))
         for end in far:
             max_bytes = MAX_HELLO_BYTES
-            if end.legacy is not None:  # a legacy robot may send its first image at once
+            if end.legacy is not None:  # a legacy robot may send its first image immediately
                 max_bytes = text_bound(self._rules.payload_bound(FRAME))
                 self._commands[end.text] = LegacyCommands(end.text, end.legacy, self._log_line)
             self._dialers.append(Dialer(end, partial(self._serve, end), reject, keys, max_bytes))
@@ -309,7 +309,7 @@ class WebSocketLink(BaseLink):
             if self._closed:
                 return False
             self._peers = (*self._peers, peer)
-            # The hello that this peer received lacks a subscription since then.
+            # The hello to this peer does not contain a subscription that was added since then.
             if announced != self._subscriptions.announced:
                 self._subscriptions.send_hello(peer)
             self._announce()
@@ -319,7 +319,7 @@ class WebSocketLink(BaseLink):
     def _leave(self, peer: Peer) -> None:
         with self._joining:
             self._peers = tuple(other for other in self._peers if other is not peer)
-            # Replaced and never changed, as other threads read it without the lock.
+            # Replaced, never changed, because other threads read it without the lock.
             self._dropped = self._dropped + peer.queue.dropped
             self._announce()
 
@@ -338,7 +338,7 @@ class WebSocketLink(BaseLink):
             self._peers = (peer, *(other for other in self._peers if other is not peer))
 
     def _pass_on(self, sender: Peer, message: Message) -> None:
-        """Pass a message of one peer to the others, because they connect only to this end."""
+        """Forward a message of one peer to the others, because they connect only to this end."""
         post = Publication(message)
         for peer in self._peers:
             if peer is not sender:
@@ -366,7 +366,7 @@ class WebSocketLink(BaseLink):
             return
         if not peer.admits(packet.key, self._rules.reject, self._log_line):
             return
-        # A peer that sends twists drives, so its next frame must not wait behind the copies for the viewers.
+        # A peer that sends twists is the driver. Its next frame must not wait behind the copies for the viewers.
         if parsed[1] is TWIST and self._peers[0] is not peer:
             self._put_first(peer)
         callbacks = self._subscriptions.of(parsed[1])

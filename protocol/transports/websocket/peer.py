@@ -50,8 +50,8 @@ class Publication:
         self._written: dict[Hashable, tuple[bytes, ...]] = {}
 
     def written(self, codec: WireFormat) -> tuple[bytes, ...]:
-        """Return the bytes for a peer of `dialect`."""
-        # Without a lock: two threads may both encode, with the same result.
+        """Return the bytes for a peer with `codec`."""
+        # Without a lock: if two threads encode it, the results are equal.
         data = self._written.get(codec.form)
         if data is None:
             data = self._written[codec.form] = codec.write(self.message)
@@ -64,17 +64,17 @@ class Publication:
 # Security limit for the handshake, and again for the hello.
 OPEN_S: Final = 2.0
 _LIBRARY_LOG: Final = logging.getLogger("websockets.sightline")
-# The library writes lines for every connection. A flood of connections must not become a flood of lines.
+# The library logs every connection. A flood of connections must not become a flood of lines.
 _LIBRARY_LOG.setLevel(logging.CRITICAL + 1)
 # No compression: it does not reduce JPEG images, and costs three times the CPU time.
 PROTOCOL_OPTIONS: Final[dict[str, Any]] = {"extensions": None, "logger": _LIBRARY_LOG}
-# Counted for a peer that did not answer a ping, or did not read for a long time.
+# Counter of peers that did not answer a ping, or did not read for a long time.
 SILENT: Final = "SILENT"
 
-# Counted for a message that the role of the sender's token does not permit.
+# Counter of messages that the sender's token does not permit.
 NOT_GRANTED: Final = "NOT_GRANTED"
 
-# Assigns a place to a client of that role. Raises PeerError without a free place.
+# Assigns a place to a client by its role. Raises PeerError without a free place.
 Promote = Callable[[str], None]
 
 # Longest delay of a ping and of the detection of silence.
@@ -93,7 +93,7 @@ class Peer:
     ) -> None:
         """Create a peer. The reading thread calls `on_change` when the peer changes its wants.
 
-        `commands` are those of a legacy robot, which must not be left driving.
+        `commands` are those of a legacy robot, which must not be left moving.
         """
         self.queue: OutgoingQueue[Publication | str] = OutgoingQueue()
         self._commands = commands
@@ -114,7 +114,7 @@ class Peer:
         if self._wire.granted is None or named in self._wire.granted:
             return True
         reject(NOT_GRANTED)
-        # A viewer that acknowledges is harmless, and would fill the log.
+        # A viewer that acknowledges frames is harmless, and would fill the log.
         if named[0] != ACK.name:
             who = self._wire.address[0] or "a client"
             log(f"rejected {'/'.join(named)} from {who}: the role of its token does not permit it "
@@ -122,7 +122,7 @@ class Peer:
         return False
 
     def offer(self, post: Publication) -> None:
-        """Send a publication if the peer wants it, now or later. A newer one replaces it. Never blocks."""
+        """Send a publication, now or later, if the peer wants it. A newer one replaces it. Never blocks."""
         if self._codec.subscribes_to(post.message.channel):
             self.queue.put(post.message, post)
             self._send()
@@ -137,7 +137,7 @@ class Peer:
         """Limit incoming messages to the largest payload that this end wants."""
         with self._wire.lock:
             self._wire.protocol.max_message_size = self._codec.bound(wanted_bytes)
-        # A thread that found the lock taken left its message to this one.
+        # Another thread that found the lock taken has left its message to this thread.
         self._send()
 
     def run(self, deliver: Callable[[Peer, IncomingMessage], None], reject: Callable[[str], None]) -> None:
@@ -163,12 +163,12 @@ class Peer:
     def _turn(
         self, keepalive: Keepalive, deliver: Callable[[Peer, IncomingMessage], None], reject: Callable[[str], None]
     ) -> bool:
-        """Read all available messages, and send. Returns False if the connection has to end."""
-        # Before reading, so that data counts that arrived during a pause of this process.
+        """Read all available messages, and send. Returns False if the connection must end."""
+        # Before reading, so that data of a pause of this process counts.
         now_us = heartbeat_us()
         for message in self._wire.receive():
             self._read(message, deliver, reject)
-        # The receiver of a message runs only when this thread waits, so this turn ends early.
+        # The receiver of a message runs only while this thread waits, so this turn ends early.
         if now_us < self._look_us:
             self._send()
             return True
@@ -198,7 +198,7 @@ class Peer:
         self._end(1001, reason)
 
     def _end(self, code: int, reason: str) -> None:
-        # Set first: a command that another thread sends now must not follow the zeros.
+        # Before the zeros, because a command of another thread must not follow them.
         self._ended = True
         for text in self._commands.farewell() if self._commands else ():
             self._wire.send_text(text.decode("ascii"))
@@ -211,7 +211,7 @@ class Peer:
 
     def _send(self) -> None:
         """Send while the socket has room."""
-        # A publisher never waits for the lock: the thread that holds it also sends the new message.
+        # A publisher never waits for the lock. The thread that holds it also sends the new message.
         lock = self._wire.lock
         while self._has_more() and lock.acquire(blocking=False):
             try:
@@ -241,7 +241,7 @@ class Peer:
 
 
 def exchange_hellos(wire: Connection, codec: SightlineV1, hello: str, settle: Promote | None) -> None:
-    """Exchange hellos. The connecting end, which has no places to assign, sends first."""
+    """Exchange hellos. The connecting end, which assigns no places, sends first."""
     if settle is None:
         wire.send_text(hello)
     try:

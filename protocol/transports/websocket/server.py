@@ -1,7 +1,7 @@
 """Run the listening end: connection limits, access checks, handshake. Shell.
 
-A connection is unidentified until its hello. One address cannot take all places of unidentified connections, and
-viewers cannot take the last places of clients that may send STOP.
+A connection is unidentified until its hello. One address cannot take all places of unidentified connections. Viewers
+cannot take the last places of clients that may send STOP.
 """
 
 from __future__ import annotations
@@ -47,18 +47,18 @@ if TYPE_CHECKING:
 
 # Security limit: identified connections of one endpoint.
 MAX_CLIENTS: Final = 16
-# Security limit: places among these for clients that may drive or send requests.
+# Security limit: reserved places of these, for clients that may drive or send requests.
 RESERVED_SLOTS: Final = 4
-# Security limit: further, unidentified connections. More are closed without a reply.
+# Security limit: additional unidentified connections. Further ones are closed without a reply.
 MAX_HANDSHAKES: Final = 16
-# Security limit: of these, from one address. A browser opens up to six connections to one host.
+# Security limit: unidentified connections of one address. A browser opens up to six connections to one host.
 MAX_HANDSHAKES_PER_ADDRESS: Final = 8
 
 _CONTROL_CHANNELS: Final = (TWIST.name, REQUEST.name, FRAME.name)
 
 
 def may_control(granted: frozenset[tuple[str, ...]]) -> bool:
-    """Return True if `granted` permits driving, requests or frames. All other clients only watch or detect."""
+    """Return True if `granted` permits driving, requests or frames. Other clients only watch or detect."""
     return any(key[0] in _CONTROL_CHANNELS for key in granted)
 
 
@@ -68,7 +68,7 @@ class Slot:
 
     address: str
     acts: bool | None = None
-    """True if it may control, see `may_control`. None for an unidentified connection."""
+    """True if it may control, see `may_control`; None for an unidentified connection."""
 
 
 class ConnectionLimits:
@@ -79,7 +79,7 @@ class ConnectionLimits:
         self._taken: set[Slot] = set()
 
     def admit(self, address: str) -> Slot | None:
-        """Assign a place for an unidentified connection from `address`, or None without a free one."""
+        """Assign a place to an unidentified connection from `address`. Returns None without a free place."""
         with self._lock:
             unknown = [one.address for one in self._taken if one.acts is None]
             if len(unknown) >= MAX_HANDSHAKES or unknown.count(address) >= MAX_HANDSHAKES_PER_ADDRESS:
@@ -89,7 +89,7 @@ class ConnectionLimits:
             return slot
 
     def problem(self, acts: bool) -> str:
-        """Return the reason why one more client has no place, or "". `acts` is True for a client that may control."""
+        """Return why one more client has no place, or "". `acts` is True for a client that may control."""
         with self._lock:
             return self._problem(acts)
 
@@ -127,7 +127,7 @@ def listening_socket(endpoint: WebSocketEndpoint) -> socket.socket:
         listening = socket.create_server(place, family=family)
     except OSError as error:
         raise _cannot_listen(endpoint, error) from None
-    # Accepted sockets inherit it.
+    # Accepted sockets inherit this option.
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
     return listening
 
@@ -135,7 +135,7 @@ def listening_socket(endpoint: WebSocketEndpoint) -> socket.socket:
 def _cannot_listen(endpoint: WebSocketEndpoint, error: OSError) -> LinkError:
     if error.errno == errno.EADDRINUSE:
         return port_in_use(endpoint.text, endpoint.port)
-    # create_server adds its arguments to strerror. An unknown host name has a negative errno.
+    # create_server adds its arguments to strerror. The errno of an unknown host name is negative.
     cause = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror
     return LinkError(
         f"cannot listen on {endpoint.text}: {cause}; use an address of this machine, e.g. ws://127.0.0.1:{endpoint.port}"
@@ -145,16 +145,16 @@ def _cannot_listen(endpoint: WebSocketEndpoint, error: OSError) -> LinkError:
 # The listening end of WebSocket: access, number of clients, and time limits of the handshake. Shell.
 
 
-# Counted for a browser request from another site, or with a host name of another machine.
+# Counter of browser requests from another site, or with the host name of another machine.
 CROSS_SITE: Final = "CROSS_SITE"
-# Counted for a client that does not offer `sightline.v1`.
+# Counter of clients that do not offer `sightline.v1`.
 WRONG_SUBPROTOCOL: Final = "WRONG_SUBPROTOCOL"
-# Counted for a client above a limit of `ConnectionLimits`.
+# Counter of clients above a limit of `ConnectionLimits`.
 TOO_MANY_CLIENTS: Final = "TOO_MANY_CLIENTS"
-# Counted for a client of wss:// whose TLS handshake fails.
+# Counter of clients of wss:// whose TLS handshake fails.
 NO_TLS: Final = "NO_TLS"
 
-# After an accept that failed, e.g. without descriptors left. Without it the thread would use a whole core.
+# Pause after a failed accept, e.g. without free descriptors. Without it the thread would use a whole core.
 _PAUSE_S: Final = 0.1
 
 
@@ -180,8 +180,8 @@ class Server:
 
         Args:
             endpoint: the endpoint.
-            serve: called for each client until it is gone. It calls its second argument with the role of the client,
-                which raises PeerError without a free place. It raises PeerError to drop the client.
+            serve: serves a client until it is gone. It calls its second argument with the role of the client, which
+                raises PeerError without a free place. It raises PeerError itself to drop the client.
             count_rejection: counts a rejection by its reason.
             log: writes one line to the log.
             keys: folder of keys and tokens, and the role of the link.
@@ -199,7 +199,7 @@ class Server:
         self._counting = threading.Lock()
         self._connection_limits = ConnectionLimits()
         self._wires: set[Connection] = set()
-        # Daemon threads, so that a client does not keep a finished process alive.
+        # Daemon threads, so that a client does not prevent the end of the process.
         self._acceptor = threading.Thread(target=self._accept_all, name="websocket-listen", daemon=True)
         self._acceptor.start()
 
@@ -221,7 +221,7 @@ class Server:
             try:
                 near, address = self._listener.accept()
                 self._welcome(near, address[0])
-            except OSError:  # already gone, or no descriptor left
+            except OSError:  # the client is gone, or no descriptor is free
                 time.sleep(_PAUSE_S)
         for end in (self._listener, self._alarm, self._bell):
             end.close()
@@ -231,7 +231,7 @@ class Server:
         slot = self._connection_limits.admit(address)
         if slot is not None and self._is_begun(near, slot):
             return
-        # Without a line in the log: `flood_limits` reports a flood once, with its rate.
+        # Not logged here, because `flood_limits` reports a flood once, with its rate.
         self._count_rejection(TOO_MANY_CLIENTS)
         # Without a reply, because a flood must not cost a thread and a handshake for each connection.
         near.close()
@@ -266,7 +266,7 @@ class Server:
         try:
             address = near.getpeername()[0]
             return tls_handshake(near, self._context, "", time.monotonic() + OPEN_S)
-        except OSError as error:  # SSLError and TimeoutError among them
+        except OSError as error:  # includes SSLError and TimeoutError
             self._reject(NO_TLS, address, f"no TLS: {getattr(error, 'reason', '') or type(error).__name__}")
             near.close()
             return None
@@ -297,16 +297,16 @@ class Server:
             self._reject(error.counted, wire.address[0], str(error))
             wire.close(error.code, str(error))
             wire.linger()
-        except ConnectionClosed as closed:  # before its hello
+        except ConnectionClosed as closed:  # before the hello
             count_close(closed, self._count_rejection)
         except (InvalidHandshake, TimeoutError):
             pass
 
     def _promote(self, wire: Connection, slot: Slot, role: str) -> None:
-        """Assign a client place. Raises PeerError without a free one."""
-        # Without tokens, the role in the hello decides between the places of clients that control and that watch.
+        """Assign a client place. Raises PeerError without a free place."""
+        # Without tokens, the role in the hello decides which kind of place the client gets.
         granted = grants_of_role(certificate_role(role)) if wire.granted is None else wire.granted
-        # A guest has the certificate of a viewer, and may drive without keys.
+        # A guest has the rights of a viewer, and may drive without keys.
         claims = wire.granted is None and role == GUEST.source
         acts = self._endpoint.legacy is not None or claims or may_control(granted)
         problem = self._connection_limits.promote(slot, acts)
@@ -354,7 +354,7 @@ class Server:
         return None
 
     def _crowding(self, wire: Connection) -> tuple[str, int, str] | None:
-        """Return the rejection of a client without a free place, if that is certain before its hello."""
+        """Return the rejection of a client without a free place, if it is certain before the hello."""
         problem = self._connection_limits.problem(wire.granted is None or may_control(wire.granted))
         return (TOO_MANY_CLIENTS, 503, problem) if problem else None
 

@@ -1,4 +1,4 @@
-"""Provide TLS for `wss://`, with certificates from a `--secure` folder. Shell (files, sockets).
+"""TLS for `wss://`, with certificates from a `--secure` folder. Shell (files, sockets).
 
     <role>.pem <role>.key  certificate of a listening end, e.g. robot.pem
     ca.pem                 authority that a connecting end trusts
@@ -55,7 +55,7 @@ def tls_handshake(near: socket.socket, context: ssl.SSLContext, host: str, deadl
     wrapped = context.wrap_socket(
         near, server_side=not host, server_hostname=host or None, do_handshake_on_connect=False
     )
-    # BaseException, because the socket must not stay open after Ctrl-C either. The peer would wait for it.
+    # BaseException, because the socket must not stay open after Ctrl-C either: the peer would wait for it.
     try:
         _finish_handshake(wrapped, deadline_s)
     except BaseException:

@@ -43,7 +43,7 @@ OPERATOR_ROLE: Final = "operator"
 VIEWER_ROLE: Final = "viewer"
 _BETWEEN_QUERIES_S: Final = 0.05
 
-# Security limits: no more answers and tokens than this are kept.
+# Security limits of stored answers and tokens.
 MAX_LISTENERS: Final = 64
 _MOST: Final[dict[type[AnyToken], int]] = {RobotToken: MAX_ROBOTS, DriverToken: MAX_ROBOTS, VisionToken: MAX_SERVICES}
 
@@ -56,7 +56,7 @@ class Discovered:
     peers: list[PeerInfo]
     tokens: frozenset[Token] = frozenset()
     left_out: int = 0
-    """Robots whose token did not fit."""
+    """Number of robots whose token did not fit."""
 
 
 def discover(connect: Sequence[str], seconds: float, secure: str = "") -> Discovered:
@@ -71,12 +71,12 @@ def discover(connect: Sequence[str], seconds: float, secure: str = "") -> Discov
 
 
 class PresentTokens:
-    """The tokens of robots and of the services that share them, as far as they fit."""
+    """The tokens of robots and of the services that share them, up to a limit."""
 
     def __init__(self) -> None:
         self._kept: dict[type[AnyToken], set[Token]] = {kind: set() for kind in _MOST}
         self.left_out = 0
-        """Robots whose token did not fit."""
+        """Number of robots whose token did not fit."""
 
     def note(self, token: AnyToken, is_present: bool) -> None:
         """Note a token that appeared or ended."""
@@ -89,16 +89,16 @@ class PresentTokens:
         elif token in kept:
             kept.discard(token)
         elif isinstance(token, RobotToken):
-            # Zenoh may report an end whose begin it did not report.
+            # Zenoh may report the end of a token whose start it did not report.
             self.left_out = max(0, self.left_out + (1 if is_present else -1))
 
     def all(self) -> frozenset[Token]:
-        """Return those that are present."""
+        """Return the present tokens."""
         return frozenset().union(*self._kept.values())
 
 
 def _own_keys(folder: str) -> RoleKeys | None:
-    """Load the keys of an operator, or those of a viewer if the folder has no others. Viewing needs no more."""
+    """Load the keys of an operator, or of a viewer if the folder has only those. Viewing needs no more."""
     only_viewer = folder and not _has(folder, OPERATOR_ROLE) and _has(folder, VIEWER_ROLE)
     return load_role_keys(folder, VIEWER_ROLE if only_viewer else OPERATOR_ROLE)
 
@@ -149,7 +149,7 @@ def usable_endpoint(locator: str) -> str:
         parse_zenoh_endpoint(text)
     except ConfigError:
         return ""
-    return "" if "%" in text else text  # the number of an interface is that of the other machine
+    return "" if "%" in text else text  # the interface number is valid on the other machine only
 
 
 def find_listeners(seconds: float) -> list[str]:
@@ -170,6 +170,6 @@ def find_listeners(seconds: float) -> list[str]:
             hellos = iter(scout.try_recv, None)
             found = {str(hello.zid): [locator for text in hello.locators if (locator := usable_endpoint(text))]
                      for hello in hellos}
-    except zenoh.ZError:  # no network at all
+    except zenoh.ZError:  # there is no network
         return []
     return sorted(min(usable, key=lambda locator: "[" in locator) for usable in found.values() if usable)

@@ -42,9 +42,9 @@ if TYPE_CHECKING:
 
 _log: Final = logging.getLogger(__name__)
 
-# A close that takes longer is left to a daemon thread, so that no process hangs on a dead peer.
+# Time limit of a close. A longer one continues on a daemon thread, so that no process hangs on a dead peer.
 CLOSE_S: Final = 1.5
-# Messages of channels up to this bound are sent immediately, never in a batch.
+# Channels with a size limit up to this value are sent immediately, never in a batch.
 EXPRESS_UP_TO_BYTES: Final = 4096
 # Security limit: stored publishers of unknown sources. A peer can invent any number of sources.
 MAX_KEPT_PUBLISHERS: Final = 32
@@ -109,7 +109,7 @@ class ZenohLink(BaseLink):
         self._subscribers: defaultdict[str, list[zenoh.Subscriber[None]]] = defaultdict(list)
         self._ending = ExitStack()
         if not shared:
-            # First in, so it runs last. The declarations below need an open session to end.
+            # Registered first, so that it runs last. The declarations below need an open session to end.
             self._ending.callback(session.close)
         self._ending.callback(lambda: self._undeclare([one for some in self._subscribers.values() for one in some]))
         self._declaring = threading.Lock()
@@ -132,10 +132,10 @@ class ZenohLink(BaseLink):
         try:
             if self._is_kept(key, source):
                 self._outlet(key, channel).publisher.put(payload, attachment=header or None)
-            # The message still passes, so that no source starves another. Only no publisher is stored.
+            # The message is still sent, so that no source blocks another. Only its publisher is not stored.
             else:
                 self._session.put(key, payload, attachment=header or None, **_options(channel))
-        except zenoh.ZError:  # closed meanwhile
+        except zenoh.ZError:  # closed in the meantime
             return False
         return True
 
@@ -181,7 +181,7 @@ class ZenohLink(BaseLink):
                 self._ending.callback(declare_token(self._session, RobotToken(self.robot)))
 
     def watch_drivers(self, callback: Callable[[str, bool], None]) -> None:
-        """Call `callback` on a thread of Zenoh with the token of each driver, and if it is present."""
+        """Call `callback` on a thread of Zenoh with each driver token, and True if it is present."""
         def note(token: AnyToken, is_present: bool) -> None:
             if isinstance(token, DriverToken) and token.robot == self.robot:
                 callback(token.token, is_present)
@@ -196,11 +196,11 @@ class ZenohLink(BaseLink):
 
         try:
             return [] if self._closed else query_presence(self._session)
-        except zenoh.ZError:  # closed meanwhile
+        except zenoh.ZError:  # closed in the meantime
             return []
 
     def close(self) -> None:
-        """Undeclare all and close the session. Idempotent, returns within two seconds, safe inside a callback."""
+        """Undeclare everything and close the session. Idempotent, returns within two seconds, safe in a callback."""
         with self._declaring:
             if self._closed:
                 return
@@ -226,7 +226,7 @@ class ZenohLink(BaseLink):
         return is_ours or key in self._outlets or len(self._outlets) < MAX_KEPT_PUBLISHERS
 
     def _outlet(self, key: str, channel: Channel) -> _MatchedPublisher:
-        """Return the publisher on `key`. The first use declares it."""
+        """Return the publisher on `key`. The first call declares it."""
         outlet = self._outlets.get(key)
         if outlet is not None:
             return outlet
@@ -240,27 +240,28 @@ class ZenohLink(BaseLink):
         import zenoh
 
         for one in subscribers:
-            with suppress(zenoh.ZError):  # gone with its session
+            with suppress(zenoh.ZError):  # the session is closed
                 one.undeclare()  # type: ignore[no-untyped-call]
 
     def _end(self) -> None:
         import zenoh
 
-        # A broken session is already closed. A publisher that another thread uses now cannot be undeclared ("Already
+        # A broken session is already closed. A publisher in use by another thread cannot be undeclared ("Already
         # borrowed", a RuntimeError). The close of the session, which always runs last, ends it.
         with suppress(zenoh.ZError, RuntimeError):
             self._ending.close()
 
 
 def declare_token(session: zenoh.Session, token: AnyToken) -> Callable[[], None]:
-    """Declare a token. It ends with the returned function, which the caller keeps until then, or with the session."""
+    """Declare a token. It ends with a call of the returned function, which the caller must store, or with the session.
+    """
     import zenoh
 
-    # Zenoh ends a token whose object is no longer referenced. The closure keeps it.
+    # Zenoh ends a token whose object is no longer referenced. The closure holds a reference.
     declared = session.liveliness().declare_token(token.key)
 
     def withdraw() -> None:
-        with suppress(zenoh.ZError):  # gone with its session
+        with suppress(zenoh.ZError):  # the session is closed
             declared.undeclare()  # type: ignore[no-untyped-call]
 
     return withdraw
@@ -269,7 +270,7 @@ def declare_token(session: zenoh.Session, token: AnyToken) -> Callable[[], None]
 def watch_tokens(
     session: zenoh.Session, pattern: str, callback: Callable[[AnyToken, bool], None]
 ) -> Callable[[], None]:
-    """Call `callback` on a thread of Zenoh with each valid token, also those of before, and if it is present."""
+    """Call `callback` on a thread of Zenoh with each valid token, also earlier ones, and True if it is present."""
     import zenoh
 
     def note(sample: zenoh.Sample) -> None:
@@ -281,7 +282,7 @@ def watch_tokens(
     watching = session.liveliness().declare_subscriber(pattern, handler, history=True)
 
     def end() -> None:
-        with suppress(zenoh.ZError):  # gone with its session
+        with suppress(zenoh.ZError):  # the session is closed
             watching.undeclare()  # type: ignore[no-untyped-call]
 
     return end
@@ -301,7 +302,7 @@ def _options(channel: Channel) -> dict[str, Any]:
 
 
 class _MatchedPublisher:
-    """A publisher with its matching status. A thread of Zenoh updates it."""
+    """A publisher with its matching status, which a thread of Zenoh updates."""
 
     def __init__(self, session: zenoh.Session, key: str, channel: Channel, ending: ExitStack) -> None:
         import zenoh
@@ -311,7 +312,7 @@ class _MatchedPublisher:
         ending.callback(self.publisher.undeclare)
         listener = self.publisher.declare_matching_listener(zenoh.handlers.Callback(self._note, indirect=False))
         ending.callback(listener.undeclare)
-        # Annotated as a bool, but it is a MatchingStatus, which is always true.
+        # Its type annotation is bool, but it is a MatchingStatus, which is always true.
         status: object = self.publisher.matching_status
         self._at_first = bool(getattr(status, "matching", status))
 
@@ -326,7 +327,7 @@ class _MatchedPublisher:
 
 
 class _ConnectedPeers:
-    """The connected peers. A thread of Zenoh updates them."""
+    """The connected peers, which a thread of Zenoh updates."""
 
     def __init__(self, session: zenoh.Session, ending: ExitStack, shared: bool = False) -> None:
         import zenoh
@@ -356,9 +357,9 @@ class _ConnectedPeers:
 #     link = fleet_link.link("r1")
 
 
-# Security limit: robots of one fleet that are present at a time, as many as a router has sessions for.
+# Security limit: present robots of one fleet, as many as the sessions of a router.
 MAX_ROBOTS: Final = 1_000
-# A robot publishes ten statuses a second. One that is silent for longer has left. Its next status adds it again.
+# Silence after which a robot has left. A robot publishes ten statuses a second. Its next status adds it again.
 LEFT_AFTER_S: Final = 10.0
 
 
@@ -385,7 +386,7 @@ def open_fleet(
         max_frame_bytes: security limit for the payload of a frame.
         secure: folder from `sightline keys`, or "".
         about: returns one line about this end for presence replies.
-        by_status: find robots by their status. Without it, the caller finds them by their tokens.
+        by_status: True to find robots by their status. Otherwise the caller finds them by their tokens.
 
     Raises:
         ConfigError: an endpoint or the pattern is invalid, or an endpoint is not of Zenoh.
@@ -426,7 +427,7 @@ class ZenohFleet(FleetLink):
 
     @property
     def losses(self) -> int:
-        """Return how often the last peer was lost, see `FleetLink`."""
+        """Return how many times the last peer was lost, see `FleetLink`."""
         return self._peers.losses
 
     def announce(self, here: PresenceAnnouncer) -> None:
@@ -434,7 +435,7 @@ class ZenohFleet(FleetLink):
         self._ending.callback(here.answer_in(self._session))
 
     def robots(self) -> list[str]:
-        """Return the ids of the robots with a status within `LEFT_AFTER_S`, in the order of their first one."""
+        """Return the ids of the robots with a status within `LEFT_AFTER_S`, ordered by their first status."""
         now_s = time.monotonic()
         for robot in [one for one, received_s in self._received_s.copy().items() if now_s - received_s > LEFT_AFTER_S]:
             del self._received_s[robot]
@@ -460,13 +461,13 @@ class ZenohFleet(FleetLink):
         self._ending.close()
 
     def declare_token(self, token: AnyToken) -> Callable[[], None]:
-        """Declare a token. It ends with the returned function, which the caller keeps, with the session or process."""
+        """Declare a token. It ends with a call of the returned function, or with the session or process."""
         return declare_token(self._session, token)
 
     def watch_tokens(self, callback: Callable[[Token, bool], None]) -> Callable[[], None]:
-        """Call `callback` on a thread of Zenoh with each token of robots and vision services, and its presence."""
+        """Call `callback` on a thread of Zenoh with each token of robots and vision services, True for present."""
         def note(token: AnyToken, is_present: bool) -> None:
-            # Detectors have groups of their own. `watch_detectors` reports one of them.
+            # Detectors have separate groups. `watch_detectors` reports one group.
             if not isinstance(token, DetectorToken):
                 callback(token, is_present)
 
@@ -475,21 +476,21 @@ class ZenohFleet(FleetLink):
         return end
 
     def find_robots(self) -> set[str]:
-        """Query the ids of all robots, also of those without a token or a status, within half a second."""
+        """Query the ids of all robots, also without a token or status, within half a second."""
         import zenoh
 
-        with suppress(zenoh.ZError):  # closed meanwhile
+        with suppress(zenoh.ZError):  # closed in the meantime
             peers = [peer.presence for peer in query_presence(self._session)]
             return {one.robot for one in peers if one.role == ROBOT_ROLE}
         return set()
 
     def watch_detectors(self, group: str, callback: Callable[[DetectorToken, bool], None]) -> Callable[[], None]:
-        """Call `callback` on a thread of Zenoh with each token in `group`, and whether it is present."""
+        """Call `callback` on a thread of Zenoh with each token in `group`, and True if it is present."""
         def note(token: AnyToken, is_present: bool) -> None:
             if isinstance(token, DetectorToken):
                 callback(token, is_present)
 
-        # Not all tokens: a site has many robots, and `watch_tokens` reports theirs.
+        # Not all tokens, because a site has many robots, and `watch_tokens` reports their tokens.
         end = watch_tokens(self._session, detectors_of(group), note)
         self._ending.callback(end)
         return end

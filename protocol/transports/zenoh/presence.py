@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
 PRESENCE_PATTERN: Final = f"{PRESENCE_PREFIX}/**"
 MAX_BYTES: Final = 512
-# Security limit: stored replies of one query, those of two full routers.
+# Security limit: stored replies to one query, as many as from two full routers.
 MAX_PEERS: Final = 2048
-# The first reply also contains the time to set up its route. The best of a few replies shows the link alone.
+# The first reply also contains the setup time of its route. The best of a few replies shows the link alone.
 QUERY_ROUNDS: Final = 3
 
 _PRINTED: Final = r"^[^\x00-\x1f\x7f-\x9f]*$"
@@ -54,7 +54,7 @@ class Presence(WireModel):
 
 @dataclass(frozen=True, slots=True)
 class PeerInfo:
-    """A peer that replied, its round trip, and the lead of its wall clock over the local one."""
+    """A peer that replied, its round trip, and the lead of its wall clock over the local clock."""
 
     presence: Presence
     round_trip_us: int
@@ -113,8 +113,8 @@ def _order(peer: PeerInfo) -> tuple[int, str, str, str]:
 def robot_with_same_id(own: Presence, answers: Iterable[PeerInfo]) -> Presence | None:
     """Return the robot that had the id of `own` first, or None.
 
-    Of two robots with the same id, the one that has run longer stays. `own` is that of the moment of the query, and the
-    others' answers are half a round trip younger.
+    Of two robots with the same id, the one that has run longer keeps it. `own` is from the time of the query, and the
+    answers are half a round trip younger.
     """
     # The same session is the same robot, seen through an earlier process.
     for peer in answers:
@@ -127,15 +127,16 @@ def robot_with_same_id(own: Presence, answers: Iterable[PeerInfo]) -> Presence |
 
 # Presence over Zenoh: a peer replies to a query. Shell.
 #
-# Without a query it costs nothing, and a reply costs some microseconds. It is independent of frames and commands. The
-# process itself replies, so that a process that died or hangs does not appear.
+# Without a query it costs nothing. A reply costs some microseconds, and is independent of frames and commands. The
+# process itself replies, so a process that died or hangs does not appear.
 
 
-# A peer without a reply by then counts as absent.
+# Time after which a peer without a reply counts as absent.
 REPLY_TIMEOUT_S: Final = 0.5
-# Longer, for a link of a long delay: the first reply takes several round trips. It ends as soon as all have replied.
+# A longer time, because on a link with a long delay the first reply takes several round trips. It ends with the last
+# reply.
 _CLAIM_TIMEOUT_S: Final = 2.0
-# Pause before the second query. A robot that has just ended no longer replies then.
+# Pause before the second query. By then, a robot that has just ended no longer replies.
 _SECOND_LOOK_S: Final = 1.0
 _HOST_CHARACTERS: Final = 64
 
@@ -155,7 +156,7 @@ class PresenceAnnouncer:
                               "letters, digits or '_', e.g. vision") from None
 
     def now(self) -> Presence:
-        """Return the reply of this moment."""
+        """Return the current reply."""
         up_us = (time.monotonic_ns() - self._began_ns) // 1000
         extra = {"about": _printed(self._about())[:MAX_ABOUT]} if self._about else {}
         return self._fixed.model_copy(update={"up_us": up_us, "clock_us": time.time_ns() // 1000, **extra})
@@ -174,7 +175,7 @@ class PresenceAnnouncer:
         return session.declare_queryable(key, handler, allowed_origin=zenoh.Locality.REMOTE).undeclare
 
     def claim(self, session: zenoh.Session) -> None:
-        """Raise LinkError if another robot on this network has this id. It queries twice before."""
+        """Raise LinkError if another robot on this network has this id. It sends two queries first."""
         other = robot_with_same_id(self.now(), query_presence(session, _CLAIM_TIMEOUT_S))
         if other is not None:
             time.sleep(_SECOND_LOOK_S)
@@ -196,10 +197,10 @@ def query_presence(session: zenoh.Session, timeout_s: float = REPLY_TIMEOUT_S) -
     replies = session.get(
         PRESENCE_PATTERN, zenoh.handlers.FifoChannel(MAX_PEERS), target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE, timeout=timeout_s,
-        # By default a router waits until each peer has room for the query: a peer that hangs would stop all others.
+        # By default a router waits until each peer has room for the query, so one peer that hangs would block all.
         congestion_control=zenoh.CongestionControl.DROP,
     )
-    # A broken or hostile peer may reply with anything, also more than once. Such replies do not count.
+    # A broken or hostile peer may reply with any data, also more than once. Such replies do not count.
     for reply in replies:
         sample = reply.ok
         if sample is None or len(answers) >= MAX_PEERS:

@@ -1,7 +1,7 @@
 """Open a Zenoh session with Sightline's settings, and convert its errors to `LinkError`. Shell.
 
-An end that listens beyond loopback answers on Sightline's own multicast group and port. Other Zenoh programs on the
-network therefore do not find it. It never connects to a peer that it found. Explicit endpoints do not need multicast.
+An end that listens beyond loopback answers on Sightline's own multicast group and port. So other Zenoh programs on the
+network do not find it. It never connects to a peer that it found. Explicit endpoints do not need multicast.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ if TYPE_CHECKING:
     import zenoh
 
 
-# The group of Zenoh.
+# Multicast group of Zenoh, with Sightline's port.
 MULTICAST_GROUP: Final = ("224.0.0.224", MULTICAST_PORT)
 MULTICAST_OFF: Final = {"enabled": False}
 
 
 def multicast_section(listen: Sequence[str]) -> dict[str, Any]:
-    """Return Zenoh's `scouting/multicast`. It is on only if the owner listens beyond loopback."""
+    """Return Zenoh's `scouting/multicast`. It is enabled only if the owner listens beyond loopback."""
     if not uses_discovery(listen):
         return MULTICAST_OFF
     never: dict[str, list[str]] = {"router": [], "peer": [], "client": []}
@@ -61,30 +61,30 @@ def multicast_address() -> str:
 
 
 LEASE_MS: Final = 2000
-# One 40 ms after the last message. TCP detects a lost packet by the packets after it. Without them, after the end of
-# a frame or a twist, it needs its timeout of at least 200 ms.
+# One keepalive follows 40 ms after the last message. TCP detects a lost packet by the packets after it. Without them,
+# at the end of a frame or a twist, it needs its timeout of at least 200 ms.
 KEEP_ALIVES_PER_LEASE: Final = 50
 MAX_MESSAGE_BYTES: Final = 1_048_576
 HANDSHAKE_MS: Final = 3000
-# Of a client with another endpoint to go to: three round trips of 260 ms. With TLS they are five.
+# Handshake timeout of a client with several endpoints: three round trips of 260 ms. With TLS there are five.
 HANDSHAKE_OF_SEVERAL_MS: Final = 800
-# Sessions at a listening end: a robot, or a vision service with twenty robots and their viewers.
+# Limit of sessions at a listening end: a robot, or a vision service with twenty robots and their viewers.
 MAX_SESSIONS: Final = 64
-# Sessions at a router.
+# Limit of sessions at a router.
 MAX_ROUTER_SESSIONS: Final = 1000
 _PROBE_TIMEOUT_S: Final = 0.3
-# Fixed in Zenoh for TCP and TLS. Nothing else in a process of ours sets it.
+# SO_LINGER of Zenoh for TCP and TLS. No other library in this process sets it.
 _LINGERS_S: Final = 10
 _LINGER: Final = struct.Struct("ii")
 RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
 
 
 def _keep(session: zenoh.Session) -> zenoh.Session:
-    """Keep a session that listens in memory for ever. After its close it takes 16 KiB."""
+    """Keep a listening session in memory forever. After its close it takes 16 KiB."""
     import ctypes
 
     # To free it, Zenoh (1.10.2) waits for a task with Python's global lock held. The thread of that task may run a
-    # callback of another session, which needs the lock: then all of Python stands for 10 s.
+    # callback of another session, which needs the lock. Then all of Python blocks for 10 s.
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(session))
     return session
 
@@ -115,7 +115,7 @@ def open_session(
         import zenoh
     except ImportError:
         raise ConfigError(f"Zenoh is not installed: {install_command('zenoh')}") from None
-    # RUST_LOG switches it on, see docs/how-to/secure-the-link.md.
+    # RUST_LOG enables it, see docs/how-to/secure-the-link.md.
     zenoh.init_log_from_env_or("off")
     # Without a handler Python prints the warnings of Zenoh to the terminal.
     logging.getLogger("zenoh").addHandler(logging.NullHandler())
@@ -131,17 +131,17 @@ def open_session(
 
 
 def close_without_waiting() -> None:
-    """Let no connection of Zenoh wait when it closes. The system still sends what is left."""
-    # For the 10 s that Zenoh sets, the close of a link whose other end hangs or is out of reach, with data left to
-    # send, blocks a thread that receives for all sessions of the process.
+    """Disable SO_LINGER on all connections of Zenoh. The system still sends the remaining data."""
+    # With the 10 s of Zenoh, closing a link with unsent data whose other end hangs blocks a thread that receives for
+    # all sessions of the process.
     for one in own_sockets():
-        with suppress(OSError):  # no such option
+        with suppress(OSError):  # the socket has no such option
             if one.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER.size) == _LINGER.pack(1, _LINGERS_S):
                 one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER.pack(0, 0))
 
 
 def _tries_each_once(listen: Sequence[str], connect: Sequence[str]) -> bool:
-    # With a time to wait, Zenoh spends all of it on the first endpoint, although another one answers.
+    # With a timeout, Zenoh spends all of it on the first endpoint, even if another one answers.
     return not listen and len(connect) > 1
 
 
@@ -193,7 +193,7 @@ def _session_config(
 
 
 def _for_zenoh(endpoint: str) -> str:
-    """Return the endpoint with its send buffer and with the number of its interface: Zenoh takes no name."""
+    """Return the endpoint with its send buffer, and with an interface number, because Zenoh accepts no name."""
     address, _, rest = endpoint.partition("%")
     name, bracket, port = rest.partition("]")
     if bracket and not name.isdigit():
@@ -205,7 +205,7 @@ def _for_zenoh(endpoint: str) -> str:
 
 
 def _handshake_ms(listen: Sequence[str], connect: Sequence[str]) -> int:
-    """Return the longest handshake. A router that hangs must not keep a client from the next one."""
+    """Return the handshake timeout. A router that hangs must not prevent a client from trying the next one."""
     has_keys = any(endpoint.startswith(("tls/", "quic/")) for endpoint in connect)
     return HANDSHAKE_OF_SEVERAL_MS if _tries_each_once(listen, connect) and not has_keys else HANDSHAKE_MS
 
@@ -217,7 +217,7 @@ def _transport_config(max_sessions: int, open_ms: int) -> dict[str, Any]:
             "tx": {
                 "lease": LEASE_MS,
                 "keep_alive": KEEP_ALIVES_PER_LEASE,
-                # A queue of one batch: data for a full link is dropped here, not sent late.
+                # A queue of one batch, so that data for a full link is dropped here, not sent late.
                 "queue": {"size": {"data_low": 1, "real_time": 1}},
             },
             "rx": {"max_message_size": MAX_MESSAGE_BYTES},
