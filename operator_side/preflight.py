@@ -1,4 +1,4 @@
-"""Checks of what a command needs: its extra is installed, and its result can be written. Shell (files)."""
+"""Checks before a command runs: its extra is installed, and its result can be written. Shell (files)."""
 
 import os
 import secrets
@@ -13,12 +13,12 @@ from sightline.protocol.errors import ConfigError, install_command
 
 _PYBULLET_UP_TO = (3, 11)
 _LONGEST_NAME: Final = 240
-"""Bytes; of the 255 of a file system, since an unfinished file beside it has a longer name."""
+"""Limit in bytes. A file system permits 255, but the unfinished file next to the result has a longer name."""
 
 
 @contextmanager
 def needs(extra: str, version: tuple[int, int] = sys.version_info[:2]) -> Iterator[None]:
-    """Turn a failed import into a ConfigError that names the extra; a failed import of Sightline stays as it is."""
+    """Convert a failed import to a ConfigError that names the extra. A failed import of Sightline is not converted."""
     try:
         yield
     except ImportError as error:
@@ -37,7 +37,7 @@ def _advice(package: str, extra: str, version: tuple[int, int]) -> str:
     return f"{package} is not installed: {install_command(extra)}"
 
 
-# --- the place of a result, checked before the work that makes it ------------------------------------------------
+# --- the file of a result, checked before the work ---------------------------------------------------------------
 
 
 def check_out_file(path: Path) -> None:
@@ -50,7 +50,7 @@ def check_out_file(path: Path) -> None:
         if path.is_dir():
             raise ConfigError(f"cannot write {path}: it is a folder; name a file in it")
         may = os.access(path if path.exists() else path.parent, os.W_OK)
-    except OSError:  # a folder of the path belongs to another user
+    except OSError:  # a folder in the path belongs to another user
         may = False
     if not may:
         raise ConfigError(f"cannot write {path}: permission denied; name a file in a folder that you may write")
@@ -58,7 +58,7 @@ def check_out_file(path: Path) -> None:
 
 @contextmanager
 def writes(path: Path, fix: str = "choose another file") -> Iterator[None]:
-    """Turn a failed write, e.g. on a full disk, into a ConfigError that names `path`."""
+    """Convert a failed write, e.g. on a full disk, to a ConfigError that names `path`."""
     try:
         yield
     except OSError as error:
@@ -67,9 +67,9 @@ def writes(path: Path, fix: str = "choose another file") -> Iterator[None]:
 
 @contextmanager
 def whole(target: Path, suffix: str = ".part") -> Iterator[Path]:
-    """Yield an unfinished file beside `target`, which replaces it at the end of the block and is removed by an error.
+    """Yield an unfinished file next to `target`. At the end of the context it replaces `target`; an error removes it.
 
-    It has another name each time, because two programs may write `target`.
+    Its name is different each time, because two programs may write `target`.
     """
     part = target.with_name(f".{target.name}.{secrets.token_hex(4)}{suffix}")
     try:
@@ -80,9 +80,9 @@ def whole(target: Path, suffix: str = ".part") -> Iterator[Path]:
 
 
 def write_whole(path: Path, content: str | bytes, fix: str = "choose another file") -> None:
-    """Write a file as a whole or not at all; a symbolic link stays one. Raises ConfigError.
+    """Write a file atomically. A symbolic link is preserved. Raises ConfigError.
 
-    What cannot be replaced, e.g. `/dev/stdout` or a file in a folder of another user, is written in place.
+    A file that cannot be replaced, e.g. `/dev/stdout` or one in a folder of another user, is written in place.
     """
     target = Path(os.path.realpath(path))
     is_replaced = not target.exists() or (target.is_file() and os.access(target.parent, os.W_OK))

@@ -1,6 +1,6 @@
-"""Prints tables and blocks of lines: columns as wide as their cells, and colors for states. Shell (a terminal).
+"""Prints tables and blocks of lines with aligned columns, and colors for states. Shell (a terminal).
 
-The width of the terminal changes nothing, so that a script reads the same lines as an operator.
+The output does not depend on the width of the terminal, so a script reads the same lines as an operator.
 """
 
 import os
@@ -21,7 +21,7 @@ _COLORED: Final = re.compile(rf"\b({'|'.join(_COLORS)})\b")
 
 
 def table_lines(rows: Iterable[Sequence[str]]) -> list[str]:
-    """Lay out rows of cells as lines with two blanks between columns; the last cell of a row widens no column."""
+    """Format rows as lines with two spaces between columns. The last cell of a row does not widen its column."""
     rows = [tuple(row) for row in rows]
     widths = [max(map(len, column)) for column in zip_longest(*(row[:-1] for row in rows), fillvalue="")]
     padded = ([*(f"{cell:<{width}}" for cell, width in zip(row[:-1], widths, strict=False)), *row[-1:]] for row in rows)
@@ -35,7 +35,7 @@ def print_table(rows: Iterable[Sequence[str]]) -> None:
 
 def print_block(lines: Iterable[str]) -> None:
     """Print lines on stdout, with colors for states on a terminal."""
-    text = "\n".join(map(printable, lines))  # a peer may have written a part of them
+    text = "\n".join(map(printable, lines))  # a peer may have written a part of the lines
     print(colored(text) if uses_color(sys.stdout) else text, flush=True)
 
 
@@ -45,6 +45,6 @@ def colored(text: str) -> str:
 
 
 def uses_color(stream: TextIO | None) -> bool:
-    """Return whether colors may be written: to a terminal, unless NO_COLOR is set (https://no-color.org)."""
-    is_terminal = stream is not None and stream.isatty()  # None: the output is closed
+    """Return True if colors may be written: to a terminal, unless NO_COLOR is set (https://no-color.org)."""
+    is_terminal = stream is not None and stream.isatty()  # None means a closed output
     return is_terminal and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"

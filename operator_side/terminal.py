@@ -1,4 +1,4 @@
-"""Live output of commands: a block of lines that redraws in place, and a progress bar. Shell (a terminal)."""
+"""Live output of commands: lines that redraw in place, and a progress bar. Shell (a terminal)."""
 
 import sys
 import time
@@ -20,11 +20,11 @@ _PLAIN_S: Final = 1.0
 
 
 class LiveBlock:
-    """Shows lines in place: `with LiveBlock() as live: live.show(lines)`. Where none can be, prints them once a second.
+    """Shows lines in place: `with LiveBlock() as live: live.show(lines)`. Without a terminal it prints once a second.
 
     Args:
-        is_progress: write to stderr, since stdout is for the result; remove the block at the end, and print one line
-            each time where it cannot be redrawn.
+        is_progress: write to stderr, because stdout is for the result. Remove the block at the end. Without a terminal,
+            print one line each time.
     """
 
     def __init__(self, is_progress: bool = False) -> None:
@@ -35,7 +35,7 @@ class LiveBlock:
         self._live = Live(console=console, auto_refresh=False, transient=is_progress) if redraws else None
 
     def show(self, lines: Sequence[str]) -> None:
-        """Show the newest lines; more frequent calls are skipped."""
+        """Show the newest lines. Calls that come too often are skipped."""
         if time.monotonic() < self._due_s:
             return
         self._due_s = time.monotonic() + (_PLAIN_S if self._live is None else _REFRESH_S)
@@ -64,7 +64,7 @@ class LiveBlock:
 
 @contextmanager
 def progress_bar(total: int, what: str = "runs") -> Iterator[Callable[..., None]]:
-    """Show a bar on stderr while the block runs, if stderr is a terminal. Returns `advance(steps=1)`."""
+    """Show a progress bar in this context, if stderr is a terminal. Yields `advance(steps=1)`."""
     console = Console(stderr=True)
     columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:

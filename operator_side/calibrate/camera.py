@@ -1,6 +1,6 @@
 """Fits a camera model to images of a chessboard or a ball from a folder, a camera or a robot. Shell (files, a link).
 
-OpenCV counts pixels from the center of the top-left one, `CameraModel` from its corner: half a pixel is added.
+OpenCV counts pixels from the center of the top-left pixel, `CameraModel` from its corner, so half a pixel is added.
 """
 
 import math
@@ -34,12 +34,12 @@ MIN_BOARDS = 5
 MAX_RMS_PX = 1.0
 MAX_FOCAL_SIGMA = 0.02
 TILT_RAD, MIN_TILTED = math.radians(15), 3
-"""Boards that all face the camera fit any focal length, even with a small standard deviation."""
+"""If all boards face the camera, any focal length fits, even with a small standard deviation."""
 MAX_BALL_SPREAD = 0.05
 MAX_PIXELS = 4096 * 4096
 _FOCAL_RANGE = (0.2, 8.0)  # focal length in image widths: 136 degrees to 7 degrees
 _NEW_VIEW = 0.03  # average movement of the corners in image widths
-_FLAGS = cv2.CALIB_FIX_K3  # k3 needs corners at every edge of the image; without them it distorts the rest
+_FLAGS = cv2.CALIB_FIX_K3  # k3 needs corners at every edge of the image; otherwise it distorts other parts
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class Mounting:
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """A chessboard, counted in inner corners (a board of 10 x 7 squares has 9 x 6)."""
+    """A chessboard, by its number of inner corners (a board of 10 x 7 squares has 9 x 6)."""
 
     columns: int
     rows: int
@@ -81,12 +81,12 @@ Corners = NDArray[np.float32]
 
 
 def find_board(jpeg: bytes, board: Board) -> Corners | None:
-    """Find the board's inner corners (N, 1, 2) in OpenCV's pixels; None unless the whole board is in the image."""
+    """Find the board's inner corners (N, 1, 2) in OpenCV pixels. None unless the whole board is in the image."""
     try:
         size = read_jpeg_size(jpeg, MAX_PIXELS)
     except WireError:
         return None
-    # The decoder of the vision service does not turn images by their EXIF data either.
+    # The decoder of the vision service does not rotate images by their EXIF data either.
     gray = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if gray is None or gray.shape != (size.height_px, size.width_px):
         return None
@@ -95,7 +95,7 @@ def find_board(jpeg: bytes, board: Board) -> Corners | None:
 
 
 def is_new_view(corners: Corners, earlier: Sequence[Corners], size: JpegSize) -> bool:
-    """Return whether a board is far enough from its earlier positions to add information."""
+    """Return True if a board is far enough from its earlier positions to add information."""
     apart_px = _NEW_VIEW * size.width_px
     return all(float(np.abs(corners - one).mean()) >= apart_px for one in earlier)
 
@@ -105,7 +105,7 @@ def from_boards(
 ) -> Calibration:
     """Fit focal length, center and distortion to `found`, the boards in `given` images of `size`.
 
-    `repeated` further images show a board in an earlier position. The length of the squares has no effect.
+    `repeated` images show a board in an earlier position. The size of the squares has no effect.
 
     Raises:
         ConfigError: too few boards or a poor fit; the error names the remedy.
@@ -193,7 +193,7 @@ def ball_finder(size: JpegSize, hsv: HsvConfig) -> Callable[[bytes], Detection |
 def from_balls(
     found: Sequence[Detection], ball: Ball, size: JpegSize, given: int, mounting: Mounting
 ) -> Calibration:
-    """Fit the focal length to `found`; the center is that of the image, without distortion.
+    """Fit the focal length to `found`. The center is that of the image, and there is no distortion.
 
     Raises:
         ConfigError: no ball, or the images disagree; the error names the remedy.
@@ -213,7 +213,7 @@ def from_balls(
 
 
 def _focal_px(detection: Detection, ball: Ball, size: JpegSize, mounting: Mounting) -> float | None:
-    """Find the focal length by bisection: with a longer lens, the same outline is a ball further away."""
+    """Find the focal length by bisection: with a longer lens, the same outline belongs to a ball further away."""
     low, high = (size.width_px * factor for factor in _FOCAL_RANGE)
     if not _away_m(detection, ball, size, mounting, low) < ball.distance_m < _away_m(
         detection, ball, size, mounting, high
@@ -229,7 +229,7 @@ def _focal_px(detection: Detection, ball: Ball, size: JpegSize, mounting: Mounti
 
 
 def _away_m(detection: Detection, ball: Ball, size: JpegSize, mounting: Mounting, focal_px: float) -> float:
-    """Return the distance of the ball along the floor with this lens; nan if impossible."""
+    """Return the distance of the ball along the floor for this focal length; nan if impossible."""
     matrix = [[focal_px, 0, size.width_px / 2 - 0.5], [0, focal_px, size.height_px / 2 - 0.5]]
     sighting = locate_sphere(detection, _model(size, matrix, (), mounting), ball.radius_m)
     return math.hypot(sighting.x_m - mounting.x_m, sighting.y_m - mounting.y_m) if sighting else math.nan
@@ -246,7 +246,7 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True, slots=True)
 class Collected(Generic[Found]):
-    """The results in `given` images of one size, without `repeated` ones. Others of a live source were `skipped`."""
+    """The results in `given` images of one size. `repeated` images gave no new result, `skipped` ones were unusable."""
 
     size: JpegSize
     found: list[Found]
@@ -258,7 +258,7 @@ class Collected(Generic[Found]):
 def folder_pictures(folder: Path) -> Iterator[bytes]:
     """Yield the JPEGs of `folder` in name order.
 
-    Raises HardwareError without one, and ConfigError for an unreadable or damaged one, or one of another size.
+    Raises HardwareError without a JPEG, and ConfigError for an unreadable or damaged one, or one of another size.
     """
     first: JpegSize | None = None
     for path in jpegs_in(folder):
@@ -282,7 +282,7 @@ def camera_pictures(camera: Camera, seconds: float) -> Iterator[bytes]:
 
 
 def robot_pictures(link: Link, seconds: float, role: str = ROLE, secure: str = "") -> Iterator[bytes]:
-    """Yield a robot's images for `seconds`; acknowledge them where permitted, so that it continues to send.
+    """Yield a robot's images for `seconds`. If the keys permit it, acknowledge them, so that the robot sends more.
 
     Raises:
         LinkError: no frame for five seconds.
@@ -320,14 +320,14 @@ def collect(
     *,
     is_live: bool = False,
 ) -> Collected[Found]:
-    """Search `pictures` until `enough` new results, or to their end; report each.
+    """Search `pictures` until `enough` new results, or to their end. Report each result.
 
     Args:
-        finder: makes, for a size, the function that searches one image.
-        is_live: skip damaged images, and those that flow control has scaled; begin again with the first larger one.
+        finder: returns, for an image size, the function that searches one image.
+        is_live: skip damaged images, and images that flow control has scaled; start again with the first larger image.
 
     Raises:
-        ConfigError: there is no image, or unless `is_live`, one is damaged or of another size.
+        ConfigError: there is no image, or one is damaged or of another size and `is_live` is False.
     """
     found: list[Found] = []
     size, given, skipped, repeated = None, 0, 0, 0

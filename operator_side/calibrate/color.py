@@ -1,7 +1,7 @@
 """Derives a color range from a place in an image, and tests it. Pure.
 
-It gives one range, or two for a color on both sides of red. The margins cover normal changes: shade scales the value,
-haze and warm light lower the saturation, JPEG and noise blur the hue.
+The result is one range, or two ranges for a color on both sides of red. The margins cover normal changes: shade scales
+the value, haze and warm light lower the saturation, JPEG and noise spread the hue.
 """
 
 from collections.abc import Sequence
@@ -21,17 +21,17 @@ Numbers = NDArray[np.float32]
 Ranges = tuple[HsvRange, ...]
 
 CLICK_PX: Final = 5
-"""A click takes the median color of a square of this side, and then all of that color around it."""
+"""A click takes the median color of a square of this side length, and then all pixels of that color around it."""
 MIN_SATURATION: Final = 0.2
 MIN_VALUE: Final = 0.1
-"""Below these, a pixel has no meaningful hue."""
+"""Limits of saturation and value below which the hue of a pixel is noise."""
 MIN_BOX_SHARE: Final = 0.3
-"""Least share of one color in a box; a disk fills 79 % of the box around it."""
+"""Least share of a single color in a box. A disk fills 79 % of the box around it."""
 MOST_MARKED: Final = 0.5
-"""A range that marks this share of an image belongs to the background."""
-_ALIKE_DEG: Final = 20.0  # from the strongest hue: the same object with its shaded side
+"""Share of an image from which a range marks the background."""
+_ALIKE_DEG: Final = 20.0  # from the strongest hue; includes the shaded side of the object
 _HUE_MARGIN_DEG: Final = 5.0
-_NARROWEST_DEG: Final = 8.0  # to either side: the table of the detector has steps of up to 4 degrees
+_NARROWEST_DEG: Final = 8.0  # to each side, because the detector's table has steps of up to 4 degrees
 _SATURATION_KEPT: Final = 0.6
 _VALUE_KEPT: Final = 0.5
 _HUE_BIN_DEG: Final = 5
@@ -61,7 +61,7 @@ class Trial:
 
 
 def pick(picture: Image, box: Box) -> Ranges:
-    """Return the range of the color there. Raises ConfigError for a place outside, without color, or with several."""
+    """Return the range of the color in the box. Raises ConfigError outside the image, or without a single color."""
     height, width = picture.shape[:2]
     inside = 0 <= box.x_px < width and 0 <= box.y_px < height
     if not inside or box.x_px + box.width_px > width or box.y_px + box.height_px > height:
@@ -71,7 +71,7 @@ def pick(picture: Image, box: Box) -> Ranges:
 
 
 def try_out(ranges: Ranges, pictures: Sequence[Image]) -> Trial:
-    """Measure the marks of `ranges` in `pictures`, of which there is at least one."""
+    """Measure the marks of `ranges` in `pictures`, at least one image."""
     masks = [mask_of(ranges, one) for one in pictures]
     shares = [cv2.countNonZero(mask) / mask.size for mask in masks]
     blobs = [cv2.connectedComponents(mask)[0] - 1 for mask in masks]
@@ -80,7 +80,7 @@ def try_out(ranges: Ranges, pictures: Sequence[Image]) -> Trial:
 
 
 def check_trial(trial: Trial) -> None:
-    """Raise ConfigError for a range that marks half of an image, or nothing."""
+    """Raise ConfigError for a range that marks half of an image, or no pixel."""
     if trial.most_share >= MOST_MARKED:
         raise ConfigError(f"this range marks {trial.most_share:.0%} of an image: the background has the same color; "
                           "pick the target itself, or change the background")
@@ -89,7 +89,7 @@ def check_trial(trial: Trial) -> None:
 
 
 def mask_of(ranges: Ranges, picture: Image) -> Image:
-    """Return 255 where the detector finds the color, 0 elsewhere."""
+    """Return 255 for pixels with the color, 0 for others, as the detector does."""
     mask = np.zeros(picture.shape[:2], np.uint8)
     region = ColorMask(ranges).region(picture)
     if region is not None:
@@ -133,7 +133,7 @@ def _hsv(picture: Image) -> Numbers:
 
 
 def _sample(hsv: Numbers, box: Box) -> Numbers:
-    """Return the pixels (N, 3) of the color there. Raises ConfigError without a single color."""
+    """Return the pixels (N, 3) of the color in the box. Raises ConfigError without a single color."""
     if box.width_px and box.height_px:
         part = hsv[box.y_px : box.y_px + box.height_px, box.x_px : box.x_px + box.width_px].reshape(-1, 3)
         return _of_one_hue(part, box)
@@ -158,7 +158,7 @@ def _of_one_hue(pixels: Numbers, box: Box) -> Numbers:
 
 
 def _grown(hsv: Numbers, box: Box, hue_deg: float) -> Numbers:
-    """Return the pixels of similar hue that are connected with the clicked one."""
+    """Return the pixels of similar hue that are connected to the clicked pixel."""
     alike = (_off_deg(hsv[..., 0], hue_deg) <= _ALIKE_DEG) & _has_hue(hsv)
     _, labels = cv2.connectedComponents(alike.astype(np.uint8))
     own = labels[box.y_px, box.x_px]
@@ -170,7 +170,7 @@ def _has_hue(hsv: Numbers) -> NDArray[np.bool_]:
 
 
 def _strongest_hue_deg(pixels: Numbers) -> float:
-    """Return the hue of the bin with the most color, together with its neighbors."""
+    """Return the hue of the bin that, with its neighbors, has the most color."""
     color = pixels[:, 1] * pixels[:, 2]
     weights, _ = np.histogram(pixels[:, 0], bins=360 // _HUE_BIN_DEG, range=(0, 360), weights=color)
     smooth = weights + np.roll(weights, 1) + np.roll(weights, -1)
@@ -195,7 +195,7 @@ def _range_of(pixels: Numbers) -> Ranges:
     common = {"saturation_low": round(max(MIN_SATURATION / 2, saturation * _SATURATION_KEPT), 2),
               "value_low": round(max(MIN_VALUE / 2, value * _VALUE_KEPT), 2)}
     first, last = round(middle + low), round(middle + high)
-    if first < 0 or last > 360:  # through red
+    if first < 0 or last > 360:  # the range includes red
         return (HsvRange(hue_low_deg=first % 360, hue_high_deg=360, **common),
                 HsvRange(hue_low_deg=0, hue_high_deg=last % 360, **common))
     return (HsvRange(hue_low_deg=first, hue_high_deg=last, **common),)

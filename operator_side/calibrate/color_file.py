@@ -1,7 +1,7 @@
-"""Writes color ranges into a configuration of vision and leaves everything else as it was. Shell (files).
+"""Writes color ranges into a configuration of the vision service and keeps the rest. Shell (files).
 
-tomlkit edits the text, since the standard library only reads TOML. Python's TOML reader then checks the result; unless
-it is as intended, nothing is changed.
+tomlkit edits the text, because the standard library only reads TOML. Python's TOML reader then checks the result. If it
+is not as intended, the file stays unchanged.
 """
 
 import os
@@ -62,7 +62,7 @@ def _edited(text: str, ranges: Ranges) -> str:
 
 
 def _item(ranges: Ranges, old: Item | None) -> Any:
-    """Return the ranges as an array, or as blocks like `old`; comments inside `old` come first."""
+    """Return the ranges as an array, or as tables if `old` has tables. Comments of `old` come first."""
     comments = "".join(f"{line.rstrip()}\n" for line in re.findall("#.*", old.as_string() if old else ""))
     if isinstance(old, AoT):
         blocks = ["".join(f"{name} = {getattr(one, name):g}\n" for name in _FIELDS) for one in ranges]
@@ -75,7 +75,7 @@ def _item(ranges: Ranges, old: Item | None) -> Any:
 
 
 def check_config(path: Path) -> None:
-    """Raise ConfigError for an invalid configuration of vision, or one that cannot be written."""
+    """Raise ConfigError for an invalid or unwritable configuration of the vision service."""
     if path.exists():
         load_service("vision", file=str(path), environ={})
     elif not path.parent.is_dir():
@@ -83,22 +83,22 @@ def check_config(path: Path) -> None:
 
 
 def write_ranges(path: Path, ranges: Ranges) -> None:
-    """Set `hsv.ranges` in the file, or create it; it changes as a whole or not at all. Raises ConfigError.
+    """Set `hsv.ranges` in the file, or create the file. The change is atomic. Raises ConfigError.
 
-    A symbolic link stays one, and the lines keep their ends.
+    A symbolic link and the line ends are preserved.
     """
     target = Path(os.path.realpath(path))
     unfinished = target.with_name(f".{target.name}.part")
     try:
         before = target.read_bytes().decode() if target.exists() else ""
-        mark = "\ufeff" if before.startswith("\ufeff") else ""  # of the byte order; TOML does not know it
+        mark = "\ufeff" if before.startswith("\ufeff") else ""  # byte order mark, which is not valid TOML
         after = mark + with_ranges(before.removeprefix(mark), ranges)
         if "\r\n" in before and "\n" not in before.replace("\r\n", ""):
             after = after.replace("\r\n", "\n").replace("\n", "\r\n")
         unfinished.write_bytes(after.encode())
         if target.exists():
             shutil.copymode(target, unfinished)
-        load_service("vision", file=str(unfinished), environ={})  # an invalid configuration is not written
+        load_service("vision", file=str(unfinished), environ={})  # raises for an invalid configuration
         unfinished.replace(target)
     except (OSError, UnicodeDecodeError) as error:
         why = getattr(error, "strerror", None) or "not a text file"

@@ -32,7 +32,7 @@ from sightline.robot_side.hardware.cameras.files import quiet_videos
 
 MAX_FILE_BYTES: Final = 50_000_000
 MAX_PIXELS: Final = 25_000_000
-"""Limit of an image file, a large photograph; the limits of the vision service bound a camera's frames."""
+"""Limit of an image file, for a large photograph. The limits of the vision service apply to camera frames."""
 PATIENCE_S: Final = 5.0
 _PAGE_QUALITY: Final = 92
 
@@ -43,7 +43,7 @@ class Gallery(Protocol):
     live: bool
 
     def pixels(self, number: int) -> Image:
-        """Return the image of that number. Raises ConfigError if it is gone."""
+        """Return the image with this number. Raises ConfigError if it is gone."""
         ...
 
     def recent(self) -> Sequence[Image]:
@@ -56,7 +56,7 @@ class Gallery(Protocol):
 
 
 class StillGallery:
-    """Images of a file."""
+    """The images of a file."""
 
     live = False
 
@@ -74,7 +74,7 @@ class StillGallery:
         return self._pictures
 
     def route(self, request: PageRequest, _body: bytes) -> HttpAnswer:
-        """Answer with image `?number=N`, else the last."""
+        """Answer with image `?number=N`, by default with the last image."""
         number = int(request.get("number", len(self._pictures)))
         done, data = cv2.imencode(".jpg", self.pixels(number), [cv2.IMWRITE_JPEG_QUALITY, _PAGE_QUALITY])
         if not done:
@@ -84,13 +84,13 @@ class StillGallery:
 
 
 class LiveGallery:
-    """A robot's newest images, taken while the page requests them."""
+    """A robot's newest images, fetched while the page requests them."""
 
     live = True
 
     def __init__(self, frames: int) -> None:
         """`frames` is the number of images for the test of a range."""
-        # The next image may arrive before the pick in the image that the page shows.
+        # The next image may arrive before the user picks in the shown image.
         self.buffer = FrameBuffer(max(2, frames))
         self.route = self.buffer.route
         self._frames = frames
@@ -108,9 +108,9 @@ class LiveGallery:
 
 
 def of_picture(path: Path) -> list[Image]:
-    """Read an image file. Raises ConfigError for an invalid one."""
+    """Read an image file. Raises ConfigError for an invalid file."""
     try:
-        if not path.is_file() and path.exists():  # a device or a pipe may have no end
+        if not path.is_file() and path.exists():  # a device or a pipe may be endless
             raise ConfigError(f"{path} is not a file; name a PNG or JPEG")
         if path.stat().st_size > MAX_FILE_BYTES:
             raise ConfigError(f"{path} is larger than {MAX_FILE_BYTES // 1_000_000} MB; use a smaller image")
@@ -133,7 +133,8 @@ def of_picture(path: Path) -> list[Image]:
 
 
 def of_video(path: Path, frames: int) -> list[Image]:
-    """Read `frames` images spread evenly over a video, or all of fewer. Raises ConfigError for an invalid one."""
+    """Read `frames` images spread evenly over a video, or all of a shorter one. Raises ConfigError for an invalid one.
+    """
     if not path.is_file():
         raise ConfigError(f"{path} is not a file; name a video")
     quiet_videos(cv2)
@@ -156,7 +157,7 @@ def _read(capture: Any) -> Iterator[Image]:
 
 
 def of_robot(pictures: Pictures, frames: int) -> list[Image]:
-    """Return the next `frames` images of a robot. Raises LinkError without one."""
+    """Return the next `frames` images of a robot. Raises LinkError without an image."""
     found: list[Image] = []
     ends_s = time.monotonic() + PATIENCE_S
     while len(found) < frames and time.monotonic() < ends_s:
@@ -175,14 +176,14 @@ def _decoded(jpeg: bytes) -> Image:
         raise ConfigError(f"invalid image from the robot: {error.detail}") from None
 
 
-# --- the page: click or box in an image, check the marks of the range, use it ------------------------------------
+# --- the page: click or draw a box, check the marks of the range, use the range ----------------------------------
 
 
 _FIELDS = ("x_px", "y_px", "width_px", "height_px")
 
 
 class PickPage:
-    """The picking of one operator. `use` takes the ranges and returns a note."""
+    """The page state of one operator. `use` receives the ranges and returns a note."""
 
     def __init__(self, gallery: Gallery, title: str, use: Callable[[Ranges], str]) -> None:
         self._gallery, self._title, self._use = gallery, title, use

@@ -1,7 +1,7 @@
-"""Turns one wheel at a time, off the ground, and compares it with the operator's answers. Shell.
+"""Turns one wheel at a time, off the ground, and compares it with the answers of the operator. Shell.
 
-It bypasses the gate, as no other command does: it needs no network and no camera. Nothing turns before an operator next
-to the robot confirms that its wheels are off the ground.
+Only this command bypasses the gate: it needs no network and no camera. No wheel turns before an operator next to the
+robot confirms that the wheels are off the ground.
 """
 
 import signal
@@ -22,7 +22,7 @@ from sightline.robot_side.ports import Drive
 
 TURN_S: Final = 1.0
 _SHARE: Final = 0.5
-"""Share of the robot's top speed, slow enough to recognize the direction of a wheel."""
+"""Share of the robot's top speed, slow enough to see the direction of a wheel."""
 _BEAT_S: Final = 0.02
 Prompt = Callable[[str], str]
 Guard = Callable[[RobotConfig], GuardianEnd]
@@ -54,12 +54,12 @@ _WRONG: Final = {"w": "the wrong way", "o": "the other wheel", "b": "both wheels
 
 
 def try_wheels(config: RobotConfig, prompt: Prompt | None, show: Print, guard: Guard | None = None) -> bool:
-    """Turn each wheel in each direction and compare it with the operator's answers.
+    """Turn each wheel in each direction and compare it with the answers of the operator.
 
     Args:
-        prompt: shows a question and returns the answer; None if the wheels are confirmed to be off the ground.
+        prompt: shows a question and returns the answer; None if it is confirmed that the wheels are off the ground.
         show: prints a line.
-        guard: makes this process the guardian of its fork, in which this function goes on.
+        guard: makes this process the guardian of its fork, in which this function continues.
 
     Returns:
         True if all answers are right, or without `prompt`.
@@ -87,17 +87,17 @@ def try_wheels(config: RobotConfig, prompt: Prompt | None, show: Print, guard: G
 
 @contextmanager
 def opened_drive(config: RobotConfig, guard: Guard | None = None) -> Iterator[tuple[Drive, GuardianEnd | None]]:
-    """Open the robot's drive; set it to zero and close it at any end: Ctrl-C, Ctrl-Z, a signal, hang-up or an error.
+    """Open the robot's drive. Set it to zero and close it at any end: Ctrl-C, Ctrl-Z, a signal, hang-up or an error.
 
-    Motors continue at their last speed when a program is killed, so every signal that can be caught is. What cannot be
-    caught is the task of the guardian.
+    Motors keep their last speed when a program is killed, so all signals that can be caught are caught. The guardian
+    covers the others.
     """
     guardian = guard(config) if guard is not None else None
     if guardian is not None:
         guardian.wait()
 
     def end(_number: int, _frame: FrameType | None) -> None:
-        for number in EXIT_SIGNALS:  # a second one, by the guardian, must not interrupt the way to zero
+        for number in EXIT_SIGNALS:  # a second signal, from the guardian, must not interrupt the ramp to zero
             signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
 
@@ -121,9 +121,9 @@ def opened_drive(config: RobotConfig, guard: Guard | None = None) -> Iterator[tu
 def turn_for(
     give: Callable[[float, float], None], values: tuple[float, float], seconds: float, guardian: GuardianEnd | None
 ) -> None:
-    """Set both values, and zero after that time or at an error. Raises HardwareError when the guardian is gone.
+    """Set both values, and zero after that time or after an error. Raises HardwareError if the guardian is gone.
 
-    The values are repeated at the pace of the control loop, for controllers and cutoffs that stop without commands.
+    The values are repeated at the rate of the control loop, for controllers and cutoffs that stop without commands.
     """
     end_s = time.monotonic() + seconds
     try:
@@ -152,7 +152,7 @@ def _what_instead(prompt: Prompt) -> str:
 
 
 def _advice(drive: PluginChoice, turn: Turn, wrong: str) -> str:
-    """Return the necessary change: an option if the drive has one, else the wiring."""
+    """Return the necessary change: an option if the drive has one, otherwise the wiring."""
     plugin, options = DRIVES.load(drive)
     known = plugin.Config.model_fields
     if wrong == "w" and "left_reversed" in known:
@@ -169,12 +169,12 @@ def _advice(drive: PluginChoice, turn: Turn, wrong: str) -> str:
 
 
 def _pins_of(options: object, side: str) -> str:
-    """Return the side in the names of the pins."""
+    """Return the side in the pin names, after `swapped`."""
     other = {"left": "right", "right": "left"}[side]
     return other if getattr(options, "swapped", False) else side
 
 
 def check_confirmed(confirmed: bool, is_terminal: bool, what: str, precaution: str) -> None:
-    """Raise ConfigError, with the precaution to take, without a confirmation and without a terminal to prompt on."""
+    """Raise ConfigError, with the precaution, without a confirmation and a terminal to request it."""
     if not confirmed and not is_terminal:
         raise ConfigError(f"{what} turns the wheels and has no terminal to confirm on; {precaution}, then add --yes")

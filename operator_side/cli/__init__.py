@@ -8,7 +8,7 @@ import sys
 
 
 def main() -> None:
-    """Run the command of this process. Ctrl-C while its modules are imported ends it as Ctrl-C does later."""
+    """Run the command of this process. Ctrl-C during the imports ends it like a later Ctrl-C."""
     try:
         from sightline.operator_side.cli import app
     except KeyboardInterrupt:

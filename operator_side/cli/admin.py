@@ -39,7 +39,7 @@ from sightline.protocol.transports.open import open_link
 from sightline.robot_side.config import RobotConfig
 
 ANSWER_S = 5.0
-"""Longest time in which the address of `sightline use` must answer."""
+"""Time limit for an answer from the address of `sightline use`."""
 
 Hosts = Annotated[
     list[str] | None,
@@ -113,12 +113,12 @@ def _print_use(values: Mapping[str, object], line: str, as_json: bool) -> None:
 
 
 def _folder(secure: str) -> str:
-    """Return the absolute path, since a command may start in another folder."""
+    """Return the absolute path, because a later command may start in another folder."""
     return str(home_path(secure).absolute()) if secure else ""
 
 
 def _answer(context: contexts.Context) -> str:
-    """Connect to the address. Returns a note if its robot is silent. Raises LinkError if nothing answers."""
+    """Connect to the address. Returns a note if its robot is silent. Raises LinkError without an answer."""
     role = viewer_role(context.secure)
     try:
         with open_link(
@@ -213,11 +213,11 @@ def install(
     """
     program = Path(sys.executable).with_name("sightline")
     file = home_path(config or Path(f"/etc/sightline/{service}.toml")).absolute()  # systemd changes the folder
-    if ".." in file.parts:  # which systemd ignores in a WorkingDirectory
+    if ".." in file.parts:  # systemd ignores such a WorkingDirectory
         file = file.parent.resolve() / file.name
     runs_it = user or os.environ.get("SUDO_USER") or getpass.getuser()
     planned, beside = units.plan(service, program, file, runs_it, units.UNIT_DIR, instances=instances), None
-    # A service that cannot start is not installed.
+    # Only a service that can start is installed.
     loaded = load_service(service, file=str(file), environ={}).config if yes or file.exists() else None
     state_dir = None
     if isinstance(loaded, RobotConfig):
@@ -232,7 +232,7 @@ def install(
             typer.echo(f"{file} does not exist yet{second}; create it before --yes", err=True)
         return
     units.check_user(runs_it)
-    if state_dir is not None and not state_dir.is_dir():  # then systemd starts no service
+    if state_dir is not None and not state_dir.is_dir():  # systemd would not start the service
         raise ConfigError(f"state_dir {state_dir} does not exist; run: sudo install -d -o {runs_it} {state_dir}")
     stale = units.drop_in_path(planned.path.parent)
     if service == "robot" and beside is None and units.take_away(stale):

@@ -1,7 +1,7 @@
 """The process of the `sightline` command: runs it, and turns every error into one line and an exit code. Shell.
 
-A plain `sightline stop` imports only what a STOP datagram needs. All other command lines are read by typer, which takes
-longer to import than a STOP takes.
+A plain `sightline stop` imports only the modules of a STOP datagram. typer parses all other command lines, but its
+import takes longer than a STOP.
 """
 
 import errno
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import typer
 
 INTERRUPTED: Final = 130
-CLOSED: Final = 141  # as a shell reports SIGPIPE
+CLOSED: Final = 141  # the exit code of a shell for SIGPIPE
 UNEXPECTED: Final = 1
 USAGE: Final = 2
 
@@ -36,7 +36,7 @@ def run(arguments: Sequence[str]) -> int:
         options = plain_options(arguments[1:]) if arguments[:1] == ["stop"] else None
         code = _typed(arguments) if options is None else send_stop(**options)
         if sys.stdout is not None:
-            sys.stdout.flush()  # here, where its failure can be reported
+            sys.stdout.flush()  # here, because its error can still be reported
         return code if isinstance(code, int) else 0
     except SightlineError as error:
         return _print_error(str(error), error.exit_code)
@@ -49,7 +49,7 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _typed(arguments: Sequence[str]) -> Any:
-    """Run a command line that typer reads. Returns the command's result."""
+    """Run a command line through typer. Returns the command's result."""
     import typer
 
     from sightline.operator_side.cli.commands import app
@@ -60,18 +60,18 @@ def _typed(arguments: Sequence[str]) -> Any:
         with _connecting_printed() if "--json" not in arguments else nullcontext():
             return app(list(arguments), standalone_mode=False, prog_name="sightline")
     except typer.Abort as ending:
-        if isinstance(ending.__cause__, EOFError):  # of the program, e.g. an empty file, not the user's end of input
+        if isinstance(ending.__cause__, EOFError):  # from the program, e.g. an empty file, not the end of stdin
             raise ending.__cause__ from None
         return INTERRUPTED
     except SystemExit as ending:
-        if isinstance(ending.__context__, BrokenPipeError):  # which typer takes for an unexpected error
+        if isinstance(ending.__context__, BrokenPipeError):  # typer treats it as an unexpected error
             raise ending.__context__ from None
         raise
 
 
 @contextmanager
 def _connecting_printed() -> Iterator[None]:
-    """Print the line of a link that waits for an answer, unless the command has a log, which shows it."""
+    """Print the line of a link that waits for an answer, unless the command has a log with this line."""
     import logging
 
     opening = logging.getLogger("sightline.protocol.transports.open")
@@ -86,7 +86,7 @@ def _connecting_printed() -> Iterator[None]:
 
 
 def plain_options(arguments: Sequence[str]) -> dict[str, Any] | None:
-    """Return the options of `stop` if all words are plain: ROBOT, --connect, --secure and --json; else None."""
+    """Return the options of `stop` if all words are plain: ROBOT, --connect, --secure and --json; otherwise None."""
     given: dict[str, Any] = {"robot": None, "connect": [], "secure": "", "as_json": False}
     words = iter(arguments)
     for word in words:
@@ -106,12 +106,12 @@ def plain_options(arguments: Sequence[str]) -> dict[str, Any] | None:
 
 
 def send_stop(robot: str | None, connect: list[str] | None, secure: str, as_json: bool) -> int:
-    """Run `sightline stop` with its options as given. Returns 0; raises SightlineError if the robot may still move."""
+    """Run `sightline stop` with the given options. Returns 0; raises SightlineError if the robot may still move."""
 
     def on_slow() -> None:
         _warn(f"STOP of {target.robot} is not confirmed, repeating; be ready to cut its power by hand")
 
-    target = target_of(robot or None, connect, secure)  # a script's unset variable must not prevent a STOP
+    target = target_of(robot or None, connect, secure)  # an unset variable of a script must not prevent a STOP
     _warn(str(target))
     lacks: list[str] = []
 
@@ -124,7 +124,7 @@ def send_stop(robot: str | None, connect: list[str] | None, secure: str, as_json
         is_stored = stop_robot(target.robot, target.connect, target.secure, secret_file, on_slow,
                                on_other_secret=on_other_secret, thread_name=ABANDONED_THREAD)
     except SightlineError as error:
-        lacks = [line for line in lacks if line != str(error)]  # keys that the link cannot read either
+        lacks = [line for line in lacks if line != str(error)]  # the error of the link already reports these keys
         raise
     finally:
         for line in lacks:
@@ -141,7 +141,7 @@ def _warn(line: str) -> None:
 
 
 def _print(line: str, stream: TextIO | None) -> None:
-    """Print a line. An output that is closed or on a full disk must neither prevent a STOP nor change its exit code."""
+    """Print a line. A closed output or a full disk must not prevent a STOP or change its exit code."""
     try:
         if stream is not None:
             print(line, file=stream, flush=True)
@@ -150,13 +150,13 @@ def _print(line: str, stream: TextIO | None) -> None:
 
 
 def _discard(stream: TextIO | None) -> None:
-    """Send the rest of an output nowhere, so that the end of the process does not fail on it."""
+    """Redirect an output to the null device, so that its error does not affect the end of the process."""
     if stream is not None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _of_system(error: OSError, arguments: Sequence[str]) -> int:
-    """Report an output that cannot be written, and a folder of the machine that is not there; others are unexpected."""
+    """Report an output that cannot be written, or a missing current folder. Other errors are unexpected."""
     if error.filename is None and error.errno in (errno.EPIPE, errno.ENOSPC):
         _discard(sys.stdout)
         if error.errno == errno.EPIPE:
@@ -176,7 +176,7 @@ def _of_system(error: OSError, arguments: Sequence[str]) -> int:
 
 
 def _unexpected(error: Exception, arguments: Sequence[str]) -> int:
-    """Print a usage error of the command line, or a fault of the program, as one line."""
+    """Print a usage error of the command line, or an internal error, as one line."""
     usage = getattr(error, "format_message", None)
     if usage is not None:
         line = _usage_line(" ".join(usage().split()), getattr(error, "ctx", None), arguments)
@@ -191,7 +191,7 @@ def _unexpected(error: Exception, arguments: Sequence[str]) -> int:
 
 
 def _usage_line(text: str, context: "typer.Context | None", arguments: Sequence[str]) -> str:
-    """Add the nearest command of the same group to a usage error that is about a command."""
+    """Add the nearest command of the same group to a usage error about a command."""
     unknown = _UNKNOWN_COMMAND.match(text)
     path = context.command_path if context else _command_path(arguments)
     if unknown is None:
@@ -206,7 +206,7 @@ def _usage_line(text: str, context: "typer.Context | None", arguments: Sequence[
 
 
 def _command_path(arguments: Sequence[str]) -> str:
-    """Return the words of the command, for an error that does not have them: an option without its value."""
+    """Return the words of the command, for an error without them, e.g. an option without its value."""
     from typer.main import get_command
 
     from sightline.operator_side.cli.commands import app
@@ -227,16 +227,16 @@ def _print_error(line: str, code: int) -> int:
 
 
 def _open_closed_streams() -> None:
-    """Open the null device in place of each standard stream that is closed, so that no socket takes its number."""
+    """Open the null device for each closed standard stream, so that no socket gets its descriptor number."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
-            null = os.open(os.devnull, os.O_RDWR)  # gets the lowest number that is free, which is `number`
-            os.set_inheritable(null, True)  # so that the processes of a robot have it too
+            null = os.open(os.devnull, os.O_RDWR)  # gets the lowest free number, which is `number`
+            os.set_inheritable(null, True)  # also for the child processes of a robot
             setattr(sys, name, os.fdopen(null, "w" if number else "r"))
 
 
 ABANDONED_THREAD: Final = "abandoned link"
-"""Name of a thread that may still open a link when the command has its result: it must not delay the exit."""
+"""Name of a thread that may still open a link when the command has its result. It must not delay the exit."""
 
 
 def main() -> None:
@@ -245,7 +245,7 @@ def main() -> None:
     _open_closed_streams()
     with suppress(KeyboardInterrupt):  # a second Ctrl-C, while the first one ends the command
         code = run(sys.argv[1:])
-    # After two, a link may be open: threads of Zenoh that call Python abort the process when its interpreter ends.
+    # After Ctrl-C a link may be open. Threads of Zenoh that call Python abort the process when its interpreter ends.
     if code == INTERRUPTED and "zenoh" in sys.modules:
         with suppress(KeyboardInterrupt, OSError, AttributeError):
             sys.stdout.flush()

@@ -108,7 +108,7 @@ def demo(
         load_scenario(name)
     wanted, kinds = numbers("--seeds", seeds, int), Kinds(AT_LEAST, EXACT)
     for seed in wanted:
-        DemoOptions(seed=seed)  # before the first demo: raises ConfigError
+        DemoOptions(seed=seed)  # raises ConfigError before the first demo
     figures = measure_demos(names, wanted, seconds, kinds, lambda line: typer.echo(line, err=True))
     checks = [{**asdict(figure), "value": figure.worst} for figure in figures]
     lines = table_lines(
@@ -154,7 +154,7 @@ def loop(
         from sightline.evaluation.checks import check_lines
 
         if peers != "none":
-            import zmq  # noqa: F401  # a peer needs it; fail here, not in a process that ends
+            import zmq  # noqa: F401  # a contestant needs it; a missing one should fail here, not in a child process
     width_px, height_px = size_of(size)
     setting = LoopSetting(
         Path(), width_px, height_px, fps, transport, detector_delay_ms, overload, seconds=seconds, peers=peers_of(peers)
@@ -162,7 +162,7 @@ def loop(
     race = run_race(setting, lambda line: typer.echo(line, err=True))
     result = _race_result(race)
     code = print_result(result, [*_table(race), "", *check_lines(race.checks)], as_json)
-    if out is not None:  # after the results, which a full disk must not lose
+    if out is not None:  # after the results are printed, because a full disk must not lose them
         _leave(out, race, result)
     return code
 
@@ -225,7 +225,7 @@ def _row(name: str, race: "Race") -> str:
     return f"{name:18} {one.answered_percent:7.1f} % {one.fps:6.1f} {ages}    {carried}  {cpu}; {memory}"
 
 
-# --- `bench network`: two machines and a bad network between them, on this one; needs root -----------------------
+# --- `bench network`: two simulated machines with a bad network between them; needs root -------------------------
 
 
 def network(
@@ -267,7 +267,7 @@ def _network_result(runs: "Sequence[NetworkRun]", worst: "Sequence[Check]", tran
 
 
 def _worst(runs: "Sequence[NetworkRun]") -> "Iterator[Check]":
-    """Yield the worst seed of each check of a row."""
+    """Yield the worst result over the seeds for each check of a row."""
     from sightline.benchmarks.network.figures import worst_of_seeds
 
     for name in dict.fromkeys(run.row.name for run in runs):
@@ -301,7 +301,8 @@ def _indented(checks: "Sequence[Check]") -> list[str]:
 
 
 _BOUND_US = {"zenoh": 1_000.0, "oip+http": 2_000.0}
-"""Bound of the median that a remote detector on the same machine may add, hot; other figures are only shown."""
+"""Limit of the median time that a warm remote detector on the same machine may add. Others are shown without a limit.
+"""
 
 
 def detector(
@@ -374,7 +375,7 @@ def streams(
 
 @contextmanager
 def _service(name: str, folder: Path) -> "Iterator[Any]":
-    """Start a service for `zenoh` and yield the robot's link, which the vision service shares; else yield None."""
+    """Start a service for `zenoh` and yield the robot's link for the vision service; otherwise yield None."""
     from sightline.evaluation.processes import Processes, free_port
     from sightline.protocol.transports.open import open_link
 
@@ -392,7 +393,7 @@ def _service(name: str, folder: Path) -> "Iterator[Any]":
 
 
 def _publish_status(robot: Any, processes: Any) -> None:
-    """Publish the status until the service receives the frames."""
+    """Publish the status until the service subscribes to the frames."""
     from sightline.protocol.channels import STATUS
     from sightline.protocol.codec import encode
     from sightline.protocol.messages import Stamp, State, Status

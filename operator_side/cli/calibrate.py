@@ -58,7 +58,7 @@ _LONGEST_WAY_M: Final = 20.0
 
 
 def run_task(task: str, config: RobotConfig, confirmed: bool) -> int:
-    """Run a task of `sightline robot`. Raises ConfigError for an unknown one."""
+    """Run a task of `sightline robot`. Raises ConfigError for an unknown task."""
     if task not in TASKS:
         hint = f" (a robot's id is given with --robot {task})" if not task.startswith("test") else ""
         raise ConfigError(no_such_name("task", task, TASKS) + hint)
@@ -68,7 +68,7 @@ def run_task(task: str, config: RobotConfig, confirmed: bool) -> int:
 
 
 def _guard(config: RobotConfig) -> "GuardianEnd":
-    """Put this command under a guardian. It ends with exit code 3 if the guardian has to stop it."""
+    """Start a guardian for this command. The command exits with code 3 if the guardian must stop it."""
     from sightline.robot_side.guardian.start import become_guardian
 
     return become_guardian(config, restarts=False)
@@ -99,9 +99,9 @@ def drive(
     try:
         _measure_rows(robot, duties, seconds, rows, confirmed=yes)
         text = _table(rows, seconds)
-        table_of(text, "these measurements")  # nothing is written that cannot be read again
+        table_of(text, "these measurements")  # validates the text before it is written
         write_whole(out, text, "choose another --out")
-    except (SightlineError, typer.Abort, KeyboardInterrupt):  # Abort: also the end of stdin
+    except (SightlineError, typer.Abort, KeyboardInterrupt):  # Abort also means the end of stdin
         if rows:
             typer.echo(f"not written; the measured table is:\n{_table(rows, seconds)}", err=True)
         raise
@@ -122,7 +122,7 @@ def _table(rows: list[tuple[float, float]], seconds: float) -> str:
 def _measure_rows(
     config: RobotConfig, duties: list[float], seconds: float, rows: list[tuple[float, float]], *, confirmed: bool
 ) -> None:
-    """Drive at each duty and append it to `rows` with its speed."""
+    """Drive at each duty and append the duty and its speed to `rows`."""
     if not hasattr(DRIVES.load(config.motors)[0], "set_duty"):
         raise ConfigError(f"drive '{config.drive.kind}' has no duty to calibrate; use a gpio drive")
     with opened_drive(config, _guard) as (opened, guardian):
@@ -139,7 +139,7 @@ def _measure_rows(
 
 
 def _distance_m(question: str) -> float:
-    """Prompt until the answer is a distance; a typing error must not discard the rows before."""
+    """Prompt until the answer is a distance. A typing error must not discard earlier rows."""
     while True:
         answer = _prompt(question)
         try:
@@ -162,7 +162,7 @@ def _prompt(question: str) -> str:
 _BOARD = re.compile(r"([0-9]{1,2})x([0-9]{1,2})")
 _BALL_PICTURES = 20
 _FARTHEST_LENS_M = 100.0
-_MOST_IN_FOLDER = 100  # the whole folder, within limits: the time of the fit grows with every view
+_MOST_IN_FOLDER = 100  # limit for a folder, because the time of the fit grows with every view
 
 _MOUNTED: Final = "[default: of the robot, or 0]."
 
@@ -244,7 +244,8 @@ def _source(
     robot: tuple[str | None, list[str] | None, str],
     seconds: float,
 ) -> tuple[Iterator[bytes], dict[str, float]]:
-    """Open the images and return them with the known mounting. Raises ConfigError unless one source is named."""
+    """Open the images and return them with the known mounting. Raises ConfigError unless there is exactly one source.
+    """
     from sightline.operator_side.calibrate import camera as sources
 
     if sum((folder is not None, plugin[0] is not None, robot[:2] != (None, None))) != 1:
@@ -266,7 +267,7 @@ def _source(
 
 
 def _check_mounting(given: Mapping[str, float | None]) -> None:
-    """Raise ConfigError for a value that no model may have, before the measurement."""
+    """Raise ConfigError before the measurement for a value that no model may have."""
     for name, value in given.items():
         bound, unit = (round(math.pi / 2, 3), "radians") if name == "pitch_rad" else (_FARTHEST_LENS_M, "meters")
         if value is not None and not -bound <= value <= bound:
@@ -354,7 +355,7 @@ def _print_skipped(count: int) -> None:
 
 
 def _quiet(_line: str) -> None:
-    """Print nothing: a ball does not move, and --json prints only the object."""
+    """Print nothing, because a ball does not move, and --json prints only the result."""
 
 
 # --- `pick-color` ------------------------------------------------------------------------------------------------
@@ -362,7 +363,7 @@ def _quiet(_line: str) -> None:
 
 _MASK = Path("pick-color-mask.png")
 _WAIT_S = 0.2
-_PAGE_S = 0.3  # in which the page fetches the result
+_PAGE_S = 0.3  # time for the page to fetch the result
 
 
 def pick_color(
@@ -413,7 +414,7 @@ def pick_color(
 
 
 def _check_mask(mask: Path, others: Mapping[str, Path | None]) -> None:
-    """Raise ConfigError for a mask that would replace another file of the command, and for one that is not a PNG."""
+    """Raise ConfigError for a mask that would replace another file of the command, or that is not a PNG."""
     if mask.suffix.lower() != ".png":
         raise ConfigError(f"invalid --mask {mask}: expected a .png file, e.g. --mask mask.png")
     for option, path in others.items():
@@ -422,7 +423,7 @@ def _check_mask(mask: Path, others: Mapping[str, Path | None]) -> None:
 
 
 def place_of(at: str | None, box: str | None) -> "Box | None":
-    """Read the place of `--at` or `--box`; None for neither. Raises ConfigError for an invalid one."""
+    """Parse the place of `--at` or `--box`; None without both. Raises ConfigError for an invalid place."""
     with needs("vision"):
         from sightline.operator_side.calibrate.color import Box
     if at and box:

@@ -1,6 +1,6 @@
-"""The table of all commands, and the typer program that imports a command's module when the command is used. Shell.
+"""The table of all commands. A command's module is imported when the command is used. Shell.
 
-The help of the program comes from the table, so that it imports no command.
+The help of the program comes from the table, so it imports no command.
 """
 
 from collections.abc import Iterator, Mapping
@@ -21,7 +21,7 @@ EXIT_CODES: Final = {
     130: "interrupted by Ctrl-C",
     141: "the program that reads the output has ended",
 }
-"""Each exit code of every command."""
+"""Exit codes of all commands, with their meaning."""
 
 
 class Entry(NamedTuple):
@@ -66,10 +66,10 @@ COMMANDS: Final = {
     "labels": Entry("Develop", "services", "Publish the simulation's labels in place of a detector"),
     "train": Entry("Develop", "evaluate", "Train the learned detector"),
 }
-"""Each command, in the order of the help."""
+"""All commands, in the order of the help."""
 
 class _Commands(Mapping[str, Any]):
-    """The commands by name; a module is imported when one of its commands is looked up."""
+    """The commands by name. A lookup of a command imports its module."""
 
     def __getitem__(self, name: str) -> Any:
         return _registered(COMMANDS[name].module)[name]

@@ -40,7 +40,7 @@ _EXAMPLE = "e.g. --token vision=keys/vision.token"
 def access_for(secure: str, tokens: Iterable[str], roles: Sequence[str], ending: ExitStack) -> Access:
     """Combine the folder `secure` with `tokens`, each `ROLE=FILE`, or `FILE` for all `roles`.
 
-    A named token replaces the one in the folder. Raises ConfigError for an unusable token.
+    A given token replaces that of the folder. Raises ConfigError for an unusable token.
     """
     if secure and not home_path(secure).is_dir():
         raise ConfigError(f"--secure {secure}: folder not found; create keys with `sightline keys init {secure}`")
@@ -70,7 +70,7 @@ def _token_in(file: Path) -> str:
 
 
 def _joined(secure: str, tokens: dict[str, Path], ending: ExitStack) -> str:
-    """Make a temporary folder with the files of `secure` and these tokens in place of its own."""
+    """Create a temporary folder with the files of `secure`, and with these tokens in place of its own tokens."""
     folder = Path(ending.enter_context(tempfile.TemporaryDirectory(prefix="sightline-conform-")))
     for file in home_path(secure).iterdir() if secure else _trusted_here():
         (folder / (file.name if secure else "ca.pem")).symlink_to(file.absolute())
@@ -89,21 +89,21 @@ def _joined(secure: str, tokens: dict[str, Path], ending: ExitStack) -> str:
 
 
 def _trusted_here() -> list[Path]:
-    """Return the authorities that this machine trusts, for a `wss://` whose certificate needs no folder."""
+    """Return the authorities that this machine trusts, for a `wss://` certificate without a folder."""
     file = ssl.get_default_verify_paths().cafile
     return [Path(file)] if file else []
 
 
-# --- output: a bar on stderr while it runs, then a table by group ------------------------------------------------
+# --- output: a progress bar on stderr, then a table by group -----------------------------------------------------
 
 
 _FEW: Final = 3
-"""This many skipped cases with the same reason become one line."""
+"""Number of cases with the same skip reason from which they share one line."""
 
 
 @contextmanager
 def progress(total: int, every: bool = False) -> Iterator[Callable[[Result], None]]:
-    """Show a bar over `total` cases below the failures, or below a line for `every` case as it ends."""
+    """Show a progress bar over `total` cases, and above it the failures, or every case if `every` is True."""
     console = Console(stderr=True)
     with Progress(
         TextColumn("{task.description:<12}"), BarColumn(), MofNCompleteColumn(), console=console, transient=True,
@@ -120,7 +120,7 @@ def progress(total: int, every: bool = False) -> Iterator[Callable[[Result], Non
 
 
 def _lines_of(result: Result, every: bool) -> Iterator[str]:
-    """Yield the lines of a case that has ended: one, and after a failure the clause and the last messages."""
+    """Yield the lines of a finished case: one line, and after a failure the clause and the last messages."""
     case = result.case
     if result.outcome is Outcome.FAILED:
         yield f"{case.id}: {result.reason}" + (f" [{case.clause}]" if every else "")
@@ -147,7 +147,7 @@ def print_results(results: Sequence[Result]) -> None:
 
 
 def _alike(results: Sequence[Result]) -> Iterator[list[Result]]:
-    """Group neighbors that are skipped for the same reason; every other case stays alone."""
+    """Group neighbors that are skipped for the same reason. Every other case is a separate group."""
 
     def sort(numbered: tuple[int, Result]) -> tuple[int, str]:
         number, one = numbered
@@ -179,11 +179,11 @@ def listing(cases: Sequence[Case]) -> str:
 
 
 _ROLES = ("vision", "operator")
-"""The roles that the kit plays where each role has its own keys."""
+"""Roles that the kit plays, if each role has its own keys."""
 _SEEN_S = 1.0
-"""As long as a robot without a status is watched once more."""
+"""Time for which a robot without a status is observed again."""
 TRIES = 3
-"""A network may lose a message, and a machine may be busy: a case fails when it fails three times in a row."""
+"""Attempts of a case before it fails, because a network may lose a message, and a machine may be busy."""
 
 Only = Annotated[
     list[str] | None, typer.Option("--only", metavar="ID", help="A case, or the prefix of several: R-CAUS; repeatable.")
@@ -219,7 +219,7 @@ Name = Annotated[str, typer.Option("--name", metavar="TEXT", help="Peer's name i
 
 @dataclass(frozen=True)
 class RunOptions:
-    """The options of each command: the cases to run, and the files of their results."""
+    """The common options of the commands: the cases to run, and the result files."""
 
     only: Only = None
     groups: Groups = None
@@ -234,7 +234,7 @@ class RunOptions:
     start: Start = ""
 
     def chosen(self, cases: Sequence[Case]) -> Sequence[Case]:
-        """Return the cases to run, or none after --list. Raises ConfigError for a file that cannot be written."""
+        """Return the cases to run; empty after --list. Raises ConfigError for a file that cannot be written."""
         found = chosen(cases, self.only or (), self.groups or ())
         if self.list_cases:
             typer.echo(listing(found))
@@ -244,7 +244,7 @@ class RunOptions:
         return found
 
     def earlier(self, cases: Sequence[Case], side: str, peer: str) -> list[Result]:
-        """Read the results that --resume has. Raises ConfigError for a damaged file and for another peer."""
+        """Read the results in the file of --resume. Raises ConfigError for a damaged file or another peer."""
         if self.resume is None or not self.resume.exists():
             return []
         try:
@@ -254,7 +254,7 @@ class RunOptions:
             raise ConfigError(f"cannot read --resume {self.resume}: {why}; name another file") from None
         whole = text[: text.rfind("\n") + 1]
         results = from_lines(whole, cases, side, self.name or peer, str(self.resume))
-        if whole != text:  # a killed run may have left half a line, to which nothing can be appended
+        if whole != text:  # a killed run may leave half a line, which must be removed before new lines
             if not whole and not text.startswith(LINE_START):
                 raise ConfigError(f"--resume {self.resume} has no results; name another file")
             self.resume.write_text(whole, "utf-8")
@@ -262,7 +262,7 @@ class RunOptions:
 
     @contextmanager
     def shown(self, total: int, side: str, peer: str) -> Iterator[Callable[[Result], None]]:
-        """Show each result as it ends, in the forms of --json-lines and --resume too."""
+        """Show each result when its case ends, and write it for --json-lines and --resume."""
         with ExitStack() as ending:
             show = ending.enter_context(progress(total, every=side != "codec"))
             store = ending.enter_context(self.resume.open("a", encoding="utf-8", buffering=1)) if self.resume else None
@@ -282,7 +282,7 @@ class RunOptions:
     ) -> list[Result] | None:
         """Run the cases against peers that the kit starts. Returns None without --jobs and --start.
 
-        Each kit gets the `options`: name -> values.
+        Each kit process receives the `options`: name -> values.
         """
         if self.jobs == 1 and not self.start:
             return None
@@ -292,7 +292,7 @@ class RunOptions:
             return jobs.run(cases, show_result)
 
     def check_one_peer(self, alone: Mapping[str, object]) -> None:
-        """Raise ConfigError where --jobs or --start stands beside an option that only one peer can have."""
+        """Raise ConfigError if --jobs or --start is combined with an option for a single peer."""
         given = [name for name, value in alone.items() if value]
         if given and (self.jobs > 1 or self.start):
             raise ConfigError(f"{given[0]} is for one peer; leave out --jobs and --start")
@@ -313,7 +313,7 @@ class RunOptions:
 
 
 def _in_order(cases: Sequence[Case], *parts: Sequence[Result]) -> list[Result]:
-    """Join earlier and new results in the order of the cases; of two for one case the last counts."""
+    """Join earlier and new results in the order of the cases. Of two results for a case the last one counts."""
     by_id = {one.case.id: one for part in parts for one in part}
     return [by_id[case.id] for case in cases if case.id in by_id]
 
@@ -339,7 +339,7 @@ def _motor_rows(file: Path) -> list[WheelRow]:
 
 
 def _use_motor_log(bench: LiveBench, file: Path | None) -> None:
-    """Let the cases read the robot's motor log. Raises ConfigError for one of another run."""
+    """Let the cases read the robot's motor log. Raises ConfigError for a log of another run."""
     if file is not None:
         t_us = RobotUnderTest(bench).stamp().t_us
         check_motor_log(_motor_rows(file), t_us, bench.robot, str(file))
@@ -347,7 +347,7 @@ def _use_motor_log(bench: LiveBench, file: Path | None) -> None:
 
 
 def _seen_of(bench: LiveBench) -> str:
-    """Return what a robot without a status does instead, as another connection of the kit sees it."""
+    """Return the behavior of a robot without a status, as a second connection of the kit observes it."""
     from sightline.conformance.robot.websocket import spoken
 
     with suppress(NotApplicableError, LinkError), spoken(bench, STATUS.name) as raw:

@@ -166,7 +166,7 @@ def list_detectors(as_json: Json = False) -> int:
 def _shipped_model() -> str:
     try:
         from sightline.vision_side.detect.onnx.detector import shipped_digest
-    except ImportError:  # the list shows the missing package
+    except ImportError:  # the list reports the missing package
         return ""
     return shipped_digest()
 
@@ -225,14 +225,14 @@ def check(
 
 
 def own_options(texts: Sequence[str]) -> dict[str, Any]:
-    """Read `--set KEY=VALUE` for a detector's own `Config`; a dot separates sections. Raises ConfigError."""
+    """Parse `--set KEY=VALUE` for a detector's own `Config`; a dot separates sections. Raises ConfigError."""
     from sightline.operator_side.config.toml_text import options_of
 
     return _nested(options_of(texts, example="min_score=0.5"))
 
 
 def _nested(options: dict[str, Any]) -> dict[str, Any]:
-    """Nest `hsv.shape=any` as option `shape` of section `hsv`. Raises ConfigError for a name that is both."""
+    """Convert `hsv.shape=any` to option `shape` of section `hsv`. Raises ConfigError for a name that is both."""
     tables: dict[str, Any] = {}
     for name, value in options.items():
         *sections, last = name.split(".")

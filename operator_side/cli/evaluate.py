@@ -80,14 +80,14 @@ def demo(
     show("all three processes ended; scoring, replaying and filming the run")
     scored = report(run)
     code = print_result(scored.to_dict(), summary(scored), as_json)
-    write_files(scored)  # after the results, which a full disk must not lose
+    write_files(scored)  # after the results are printed, because a full disk must not lose them
     if open_it:
         webbrowser.open((scored.run.folder / "run.mp4").as_uri())
     return code
 
 
 def _check_story(options: "DemoOptions") -> None:
-    """Raise ConfigError for an option that the story has its own value for."""
+    """Raise ConfigError for an option whose value the story fixes."""
     from dataclasses import fields
 
     for field in fields(options):
@@ -109,7 +109,7 @@ def _make_story(out: Path | None, seed: int, show: Callable[[str], None], *, as_
 
 
 def _seconds(scenario: str, given: float | None) -> float:
-    """Return the length of a demo: as given, to the end of a course, or 20 s."""
+    """Return the length of a demo: the given one, that of the course, or 20 s."""
     from sightline.sim.scenario import load_scenario
 
     if given is not None:
@@ -120,7 +120,7 @@ def _seconds(scenario: str, given: float | None) -> float:
 
 
 def _check_installed(*packages: str) -> None:
-    """Raise ConfigError for a missing package before the run, although only the report needs it."""
+    """Raise ConfigError for a package that is missing, before the run, even if only the report needs it."""
     with needs("all"):
         for package in packages:
             if find_spec(package) is None:
@@ -186,7 +186,7 @@ _PHOTOS = f"Score balls put into these photographs, and false alarms; `{SHIPPED}
 _COLUMN = "`all`, or names separated by commas, e.g. blur,all at once. With --photos, one name: its camera takes them."
 FRAMES = 100
 FROM = 900_000
-"""The same as in sim/scenes/model.py, whose imports are too heavy for the command line. A test compares them."""
+"""Equal to FROM in sim/scenes/model.py, whose imports are too slow for the command line. A test compares them."""
 
 
 def detectors(
@@ -246,7 +246,7 @@ def detectors(
 
 def _score_photos(photos: Path, build: "Callable[[Sequence[str]], list[Subject]]", each: int, looks: int, *,
                   seed: int, column: str, tracked: bool, colored: bool, as_json: bool) -> int:
-    """`build` takes more settings."""
+    """Score detectors on photographs. `build` receives additional settings."""
     from sightline.evaluation import photographs as folder
     from sightline.evaluation.score.ball_textures import KINDS
     from sightline.evaluation.score.detector_report import close_subjects
@@ -279,7 +279,7 @@ def _score_photos(photos: Path, build: "Callable[[Sequence[str]], list[Subject]]
 def _subjects(
     names: Sequence[str], file: str | None, sets: Sequence[str], device: str | None
 ) -> "list[Subject]":
-    """Build the detectors as `sightline vision` does with the same options, without the service around them."""
+    """Build the detectors as `sightline vision` does with the same options, but without the service."""
     from sightline.evaluation.score.detector_report import subjects
 
     loaded = load_service("vision", file=file, sets=sets, options={"detector.device": device}, environ=os.environ)
@@ -289,7 +289,7 @@ def _subjects(
 
 
 def _whose_options(names: Sequence[str], loaded: "Loaded") -> str:
-    """Return the detector that the options belong to: the configured one, or the only one compared."""
+    """Return the detector to which the options apply: the configured one, or the only compared one."""
     settings: Any = loaded.config
     is_named = loaded.origin(("detector", "kind")) != "default"
     whose: str = names[0] if len(names) == 1 and not is_named else settings.detector.kind
@@ -299,7 +299,7 @@ def _whose_options(names: Sequence[str], loaded: "Loaded") -> str:
 
 
 def _check_device(names: Sequence[str], settings: Any) -> None:
-    """Raise ConfigError if no detector of the list accepts a device."""
+    """Raise ConfigError if no detector in the list accepts a device."""
     from sightline.vision_side.detect.registry import check_device
 
     alone = {"fallback": "", "shadow": ""}
@@ -339,7 +339,7 @@ def _columns(given: str) -> list[str]:
 
 
 JOBS = min(4, (os.cpu_count() or 1) + 1)
-"""A row waits more than it computes. A row that other load disturbed too much runs again."""
+"""A row mostly waits, so several run in parallel. A row that other load disturbed too much runs again."""
 
 
 def faults(
@@ -385,7 +385,7 @@ def faults(
 
 
 def _remove_if_empty(folder: Path) -> None:
-    with suppress(OSError):  # a failed row leaves its logs
+    with suppress(OSError):  # a failed row leaves its logs in the folder
         folder.rmdir()
 
 
@@ -405,13 +405,13 @@ BATCH = 32
 RATE = 0.003
 OVER_PHOTOS = 60_000
 VALIDATED = 5000
-"""The values of DRAWN in the card of the shipped model; a test compares them. Other code made the last round of the
-shipped one on a GPU, as the card states."""
+"""The values of DRAWN in the card of the shipped model; a test compares them. The last round of the shipped model used
+other code on a GPU, as the card states."""
 OUT = Path("runs/train")
 _STEPS = "Steps of one round; repeat the option for more rounds, each with a new learning rate and more scenes."
 _START = "Train only the last round, starting from this model."
 _LEAST_SHARE = 8
-"""Images of a batch for each training process: the normalization needs several."""
+"""Least number of images per training process in a batch, because the normalization needs several."""
 
 
 def train(
@@ -460,7 +460,7 @@ def train(
 
 
 def _begun(model: Path) -> "tuple[Weights, str]":
-    """Read the weights of a model and its SHA-256."""
+    """Return the weights of a model and its SHA-256."""
     from sightline.training.export import weights_in
 
     if model.exists() and not model.is_file():  # a pipe or a device may have no end
@@ -470,7 +470,7 @@ def _begun(model: Path) -> "tuple[Weights, str]":
         return weights_in(data), hashlib.sha256(data).hexdigest()
     except OSError as error:
         raise ConfigError(f"--start {model}: {error.strerror or error}") from None
-    except Exception as error:  # onnx raises errors of its own for a model of another form
+    except Exception as error:  # onnx raises its own errors for another kind of model
         raise ConfigError(f"--start {model}: {error_text(error)}; name a model from `sightline train`") from None
 
 

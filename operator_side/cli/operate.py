@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sightline.protocol.transports.link import Link
 
 _PERIOD_S: Final = 0.25
-_REPORT_S: Final = 0.8  # the vision service reports twice a second; `status` waits for a report where one may come
+_REPORT_S: Final = 0.8  # longest wait of `status` for a report; the vision service reports twice a second
 
 
 def register(app: typer.Typer) -> None:
@@ -42,7 +42,7 @@ def register(app: typer.Typer) -> None:
     app.command(epilog="Example: sightline mission r1 follow")(mission)
     app.command(
         epilog="Example: sightline goto r1 1.5 1.5 0 0 --wait",
-        context_settings={"ignore_unknown_options": True},  # so that -1.5 is a number
+        context_settings={"ignore_unknown_options": True},  # so that -1.5 is parsed as a number
     )(goto)
     app.command(epilog="Example: sightline teleop r1 --connect tcp/192.168.1.20:7447 --linear 0.15")(teleop)
 
@@ -83,13 +83,13 @@ def status(
     from sightline.operator_side.client.pictures import viewer_role
 
     target = target_of(robot, connect, secure)
-    role = viewer_role(target.secure) if target.secure else SOURCE  # the keys of a viewer are enough
+    role = viewer_role(target.secure) if target.secure else SOURCE  # the keys of a viewer are sufficient
     with _link(target, role) as link:
         missions = MissionClient(link)
         if watch:
             return follow_status(missions, verbose=verbose, as_json=as_json)
         state = missions.operator.wait_report().status
-        # Images leave only if a vision service or a viewer takes them. In HOLD the camera may be gone.
+        # A robot sends images only to a vision service or a viewer. In HOLD its camera may be gone.
         is_seen_to = state.holder is not None or state.stream.fps > 0 or state.state is State.HOLD
         report = missions.newest(_REPORT_S if is_seen_to else 0.0)
         if as_json:
@@ -102,7 +102,8 @@ def status(
 def follow_status(
     missions: "MissionClient", *, verbose: bool, as_json: bool = False, ends_s: float = float("inf")
 ) -> int:
-    """Show a robot's status, or that it is silent, until `ends_s` (monotonic) or Ctrl-C; in place on a terminal."""
+    """Show a robot's status, or its silence, until `ends_s` (monotonic) or Ctrl-C. On a terminal it redraws in place.
+    """
     from sightline.operator_side.terminal import LiveBlock
 
     with LiveBlock() as live:
@@ -241,7 +242,7 @@ def mission(
         option, example = ("--set", "--set KEY=VALUE") if sets else ("--label", f"--label {label}")
         raise ConfigError(f"{option} needs a mission to start; name it, e.g. sightline mission r1 follow {example}")
     if name is not None:
-        request_of(0, name, (), options)  # reports what is invalid without a robot
+        request_of(0, name, (), options)  # reports invalid values without a robot
     target = target_of(robot, connect, secure, announce=name is not None)
     with _missions(target) as missions:
         report = missions.report() if name is None else missions.request(name, options=options)
@@ -306,7 +307,7 @@ def _waypoints(numbers: list[str], file: Path | None) -> "Waypoints":
 
 
 def _print_obstacle(missions: "MissionClient") -> None:
-    """Name the command without which the robot does not drive."""
+    """Print the command that is still necessary before the robot drives."""
     from sightline.operator_side.client.status import next_step
 
     robot, report = missions.operator.robot, missions.operator.report

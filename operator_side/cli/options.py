@@ -86,7 +86,7 @@ Number = TypeVar("Number", int, float)
 
 @contextmanager
 def plugin_prints(as_json: bool) -> Iterator[None]:
-    """With `--json`, send what a plug-in prints meanwhile to stderr: stdout has the result only."""
+    """With `--json`, redirect the output of plug-ins to stderr, so that stdout contains only the result."""
     with redirect_stdout(sys.stderr) if as_json else nullcontext():
         yield
 
@@ -94,7 +94,7 @@ def plugin_prints(as_json: bool) -> Iterator[None]:
 def print_result(result: dict[str, Any], lines: Iterable[str], as_json: bool) -> int:
     """Print the result of a command with checks as JSON or as `lines`, and return the exit code.
 
-    A result whose `ok` is missing or None has nothing to fail.
+    A result whose `ok` is missing or None cannot fail.
     """
     for line in (json.dumps(_finite(result), allow_nan=False),) if as_json else lines:
         typer.echo(line)
@@ -102,7 +102,7 @@ def print_result(result: dict[str, Any], lines: Iterable[str], as_json: bool) ->
 
 
 def _finite(value: Any) -> Any:
-    """Replace each number that JSON lacks, e.g. an infinite bound, by None."""
+    """Replace each number that JSON does not support, e.g. an infinite limit, by None."""
     if isinstance(value, dict):
         return {key: _finite(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
@@ -111,18 +111,18 @@ def _finite(value: Any) -> Any:
 
 
 def first_given(given: Mapping[str, object]) -> str:
-    """Return the first option whose value was given, or ""."""
+    """Return the first option with a value, or ""."""
     return next((option for option, is_given in given.items() if is_given), "")
 
 
 def check_camera_sets(camera: str | None, camera_sets: list[str] | None) -> None:
-    """Raise ConfigError for options of no camera."""
+    """Raise ConfigError for camera options without a camera."""
     if camera_sets and camera is None:
         raise ConfigError("--camera-set needs --camera; name a camera, e.g. --camera v4l2")
 
 
 def numbers(option: str, text: str, kind: Callable[[str], Number]) -> list[Number]:
-    """Read the numbers of an option, separated by commas. Raises ConfigError with an example."""
+    """Parse the numbers of an option, separated by commas. Raises ConfigError with an example."""
     try:
         return [kind(part) for part in text.split(",")]
     except ValueError:
@@ -132,7 +132,7 @@ def numbers(option: str, text: str, kind: Callable[[str], Number]) -> list[Numbe
 
 
 def command_group(summary: str) -> typer.Typer:
-    """Make a group of subcommands that lists them when none is given."""
+    """Create a group of subcommands. Without a subcommand it lists them."""
     group = typer.Typer(help=summary, rich_markup_mode=None, invoke_without_command=True)
     group.callback(invoke_without_command=True)(_list_subcommands)
     return group

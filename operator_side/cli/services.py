@@ -198,7 +198,7 @@ def vision(
     """
     start_log(log, "vision")
     _check_vision_options(camera, camera_sets, dry_run=dry_run, share=share)
-    if robot is not None and "://" in robot:  # the address of a robot that has no id
+    if robot is not None and "://" in robot:  # the address of a robot without an id
         connect, robot = [*(connect or ()), robot], None
     options = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect), "secure": secure,
                "detector.kind": detector, "detector.device": device, "detector.shadow": shadow,
@@ -393,7 +393,7 @@ def check(service: ServiceName, file: File = None, profile: Profile = None, sets
 
 
 def _check_names(config: BaseModel) -> None:
-    """Check that devices, scenario, robot, detectors and missions exist, with their options. Opens no device."""
+    """Check that devices, scenario, robot, detectors and missions exist, and their options. Opens no device."""
     if isinstance(config, RobotConfig):
         from sightline.robot_side.guardian.start import zero_of
 

@@ -105,7 +105,7 @@ def _message_form(as_json: bool) -> Callable[[Message], str]:
 
 
 def _target_form(robot: str, as_json: bool, as_csv: bool) -> Callable[[Message], str]:
-    """Return what formats a report as the target's line. The first line of CSV names the columns."""
+    """Return a function that formats a report as the target's line. For CSV it first prints the column names."""
     if as_csv:
         typer.echo(",".join(TARGET_COLUMNS))
 

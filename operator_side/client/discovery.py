@@ -22,7 +22,7 @@ _ROLE_WIDTH = 9
 
 
 def lines(found: Discovered) -> Iterator[str]:
-    """Format a line for each: robots first, then the other peers."""
+    """Format a line for each robot, then for each other peer."""
     statuses, peers, shared = found.statuses, found.peers, shared_robots(found.tokens)
     robots = {peer.presence.robot: peer for peer in peers if peer.presence.role == ROBOT_ROLE}
     for robot in sorted(_robots(found)):
@@ -59,7 +59,7 @@ def as_object(found: Discovered) -> dict[str, Any]:
 
 
 def shared_robots(tokens: Collection[Token]) -> dict[str, tuple[str, str]]:
-    """Return the services that share each robot: the one that drives it, and the one that stands by; "" without one."""
+    """Return the services of each shared robot: the one that drives it, and the standby; "" for a missing one."""
     weights = {token.name: token.weight for token in tokens if isinstance(token, VisionToken)}
     if not weights:
         return {}
@@ -113,15 +113,15 @@ def _status_object(robot: str, message: Message) -> dict[str, Any]:
 
 
 SCOUT_S: Final = 0.4
-"""A peer answers a multicast within milliseconds. It is repeated within this time, since Wi-Fi loses many."""
+"""Duration of a multicast search. Peers answer within milliseconds, but it is repeated, because Wi-Fi loses many."""
 _PROBE_S: Final = 0.2
 _PLACES: Final = 16
-"""Security limit: the most places that are queried, however many answer."""
+"""Security limit: number of queried places, even if more peers answer."""
 
 
 @dataclass(frozen=True, slots=True)
 class DiscoveryReport:
-    """The robots and peers of each place, or its error."""
+    """For each place its robots and peers, or its error."""
 
     places: dict[str, Discovered | SightlineError]
 
@@ -149,7 +149,7 @@ class DiscoveryReport:
 
 
 def discover_all(connect: Sequence[str] | None, seconds: float, secure: str) -> DiscoveryReport:
-    """Query the given endpoints; without them this machine, else the peers that answer a multicast.
+    """Query the given endpoints. Without them query this machine, then the peers that answer a multicast.
 
     Raises:
         ConfigError: an endpoint is invalid.

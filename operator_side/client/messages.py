@@ -17,7 +17,7 @@ from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 
 MAX_WAITING: Final = 64
-"""The most messages that wait for printing; further ones are dropped and counted."""
+"""Limit of messages that wait for printing; further ones are dropped and counted."""
 
 
 class ChannelInbox:
@@ -41,11 +41,11 @@ class ChannelInbox:
 
     @property
     def dropped(self) -> int:
-        """Return the number of messages that were not printed."""
+        """Return the number of dropped messages."""
         return self._overflow + (self._picture.dropped if self._picture else 0)
 
     def take(self, timeout_s: float) -> Message | None:
-        """Take the next message, in order; of an image channel only the newest.
+        """Take the next message in order; on an image channel only the newest.
 
         Args:
             timeout_s: longest wait, s.
@@ -74,7 +74,7 @@ class ChannelInbox:
             self._overflow += 1
 
 
-# --- any message as one line, or as one object for a script ------------------------------------------------------
+# --- any message as one line, or as a JSON object for a script ---------------------------------------------------
 
 
 _LEFT_OUT: Final = ("v",)
@@ -82,7 +82,7 @@ _EMPTY: Final[tuple[Any, ...]] = (None, "", {}, [], ())
 
 
 def message_object(message: Message) -> dict[str, Any]:
-    """Return header and payload, decoded, in JSON types; `error` describes an invalid message."""
+    """Return the decoded header and payload in JSON types. `error` describes an invalid message."""
     read: dict[str, Any] = {"channel": message.channel.name}
     if message.source:
         read["source"] = message.source
@@ -93,7 +93,7 @@ def message_object(message: Message) -> dict[str, Any]:
 
 
 def message_line(message: Message) -> str:
-    """Format a message as one line; of images and scans only their size."""
+    """Format a message as one line. For images and scans it contains only the size."""
     read = message_object(message)
     name = message.channel.name + (f"/{message.source}" if message.source else "")
     if "error" in read:
@@ -174,7 +174,7 @@ TARGET_COLUMNS: Final = (
 
 
 def target_object(message: Message) -> dict[str, Any]:
-    """Return the target of a report in `TARGET_COLUMNS`, None for what is absent; `phase` describes an invalid message.
+    """Return the target of a report in `TARGET_COLUMNS`, None for missing values. `phase` describes an invalid report.
 
     `t_us` is the capture time of its image, on the robot's clock.
     """

@@ -1,6 +1,6 @@
 """Mission requests to a vision service, its reports, and the waypoints of `goto`. Shell (waits).
 
-A waypoint file has one waypoint per line: two numbers separated by blanks or a comma. A `#` starts a comment.
+A waypoint file has one waypoint per line: two numbers separated by spaces or a comma. A `#` starts a comment.
 """
 
 import re
@@ -36,7 +36,7 @@ _NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,
 
 
 def waypoints_of(texts: Sequence[str]) -> Waypoints:
-    """Read waypoints from `X Y X Y ...`. Raises ConfigError that names the first invalid one."""
+    """Parse waypoints from `X Y X Y ...`. Raises ConfigError that names the first invalid waypoint."""
     numbers = [_number(text, f"waypoint {at // 2 + 1}") for at, text in enumerate(texts)]
     if len(numbers) % 2:
         raise ConfigError(f"waypoint {len(numbers) // 2 + 1}: has an X and no Y; write X Y [X Y ...] in meters")
@@ -44,7 +44,7 @@ def waypoints_of(texts: Sequence[str]) -> Waypoints:
 
 
 def waypoints_of_file(text: str, name: str) -> Waypoints:
-    """Read waypoints from a file's `text`. Raises ConfigError that names file and line."""
+    """Parse waypoints from the `text` of a file. Raises ConfigError that names file and line."""
     found = []
     for number, line in enumerate(text.splitlines(), 1):
         parts = line.partition("#")[0].replace(",", " ").split()
@@ -80,12 +80,12 @@ def _counted(found: Waypoints) -> Waypoints:
 
 REPEAT_S: Final = 0.2
 PATIENCE_S: Final = 3.0
-"""The time of six reports, and a little more than the greatest age of a mission request."""
+"""The time of six reports, slightly more than the largest accepted age of a mission request."""
 _REPORTER: Final = "vision"
 
 
 class MissionClient:
-    """Sends an operator's mission requests to one vision service. Every wait is bounded."""
+    """Sends an operator's mission requests to one vision service. Every wait has a limit."""
 
     def __init__(self, link: Link) -> None:
         """Subscribe to the mission reports.
@@ -103,7 +103,7 @@ class MissionClient:
         link.subscribe(REPORT, self._on_report)
 
     def newest(self, timeout_s: float) -> MissionReport | None:
-        """Return the newest report if one arrived recently or arrives within `timeout_s`, for display."""
+        """Return the newest report, for display, if one arrived recently or arrives within `timeout_s`."""
         with self._changed:
             self._changed.wait_for(self._is_fresh, timeout_s)
             return self._report if self._is_fresh() else None
@@ -123,7 +123,7 @@ class MissionClient:
         return self._next(lambda _report: True, timeout_s)
 
     def request(self, name: str, waypoints: Waypoints = (), options: Mapping[str, Any] | None = None) -> MissionReport:
-        """Request a mission until a report names the request.
+        """Repeat a mission request until a report names it.
 
         Args:
             name: name of the mission.
@@ -131,7 +131,7 @@ class MissionClient:
             options: options of the mission.
 
         Returns:
-            The report. A non-empty `refused` in it is the reason of a rejection.
+            The report. If its `refused` is not empty, it is the reason of a rejection.
 
         Raises:
             ConfigError: the request does not fit the protocol.
@@ -139,7 +139,7 @@ class MissionClient:
         """
         self._id += 1
         request = request_of(self._id, name, waypoints, options or {})
-        # Repeats cite the same status, so the age of a request counts from the first one.
+        # Repeated requests cite the same status, so the age of a request counts from the first one.
         echo = Echo.of(self.operator.wait_report().stamp)
         mine = self._newest_id()
         deadline_s = time.monotonic() + PATIENCE_S
@@ -154,7 +154,7 @@ class MissionClient:
         raise LinkError(self._silence())
 
     def follow(self, timeout_s: float = PATIENCE_S) -> Iterator[MissionReport]:
-        """Yield each report that differs from the one before, until the requested mission is over.
+        """Yield each report that differs from the last one, until the requested mission is over.
 
         Raises:
             LinkError: no report within `timeout_s`, or another mission replaced the requested one.
@@ -195,7 +195,7 @@ class MissionClient:
                 "repeat the command")
 
     def _on_report(self, message: Message) -> None:
-        """Store the report and return; runs on the transport's thread."""
+        """Store the report and return; called on a thread of the transport."""
         try:
             report = decode(MissionReport, message.payload, REPORT.max_payload_bytes)
         except WireError:
@@ -210,7 +210,7 @@ class MissionClient:
 
 
 def request_of(number: int, name: str, waypoints: Waypoints, options: Mapping[str, Any]) -> MissionRequest:
-    """Make the message. Raises ConfigError for a name, a waypoint or an option that the protocol does not permit."""
+    """Create the message. Raises ConfigError for a name, a waypoint or an option that the protocol does not permit."""
     try:
         request = MissionRequest(id=number, name=name, waypoints=waypoints, options=dict(options))
     except ValidationError as error:
@@ -249,7 +249,7 @@ def mission_lines(report: MissionReport) -> Iterator[str]:
 
 
 def vision_fault_lines(report: MissionReport) -> Iterator[str]:
-    """Format the exceptions of the vision service so far; nothing without them."""
+    """Format the exceptions of the vision service so far; empty without exceptions."""
     if report.faults:
         yield f"faults    {counts_text(report.faults)}; the log of the vision service has the tracebacks"
 
@@ -262,5 +262,5 @@ def detector_line(report: MissionReport) -> str:
 
 
 def cannot(report: MissionReport) -> bool:
-    """Return True if a mission is over because it failed or cannot reach its goal."""
+    """Return True if a mission has ended because it failed or cannot reach its goal."""
     return report.done and (report.phase in ("failed", "cannot reach") or report.note.startswith("cannot"))

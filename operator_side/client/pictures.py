@@ -18,7 +18,7 @@ from sightline.protocol.transports.security import certificate_role
 
 
 class FrameViewer:
-    """The session of one viewer, which acknowledges frames where its keys permit it."""
+    """The session of one viewer. It acknowledges frames if its keys permit it."""
 
     def __init__(self, link: Link, role: str, secure: str = "") -> None:
         """Create the session.
@@ -34,7 +34,7 @@ class FrameViewer:
         self._seq = 0
 
     def acknowledge(self, message: Message) -> bool:
-        """Acknowledge a frame, where that is permitted. Returns False for an invalid one."""
+        """Acknowledge a frame, if that is permitted. Returns False for an invalid frame."""
         try:
             frame = decode(FrameHeader, message.header)
         except WireError:
@@ -55,14 +55,14 @@ class FrameViewer:
 
 VIEWER: Final = "viewer"
 PATIENCE_S: Final = 1.5
-"""Without an overlay for this time no vision service draws one, and frames are shown."""
+"""Time without an overlay after which frames are shown, because no vision service draws one."""
 SILENT_S: Final = 1.0
-"""Ten times the period of a robot's status."""
+"""Silence after which a robot is offline: ten times the period of its status."""
 
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One image; `session`, `seq` and `t_us` (robot clock, capture) are those of its frame."""
+    """One image. `session`, `seq` and `t_us` (capture time on the robot's clock) are those of its frame."""
 
     channel: Channel
     jpeg: bytes
@@ -74,14 +74,14 @@ class Shot:
 
 
 def viewer_role(secure: str) -> str:
-    """Return the role of a viewer: operator if `secure` has its keys, since a viewer may not even acknowledge."""
+    """Return the role of a viewer: operator if `secure` has its keys, because a viewer may not acknowledge."""
     folder = home_path(secure)
     is_operator = secure and any((folder / f"operator.{kind}").is_file() for kind in ("key", "token"))
     return OPERATOR if is_operator else VIEWER
 
 
 class Pictures:
-    """The newest image, taken by one thread at a time. The first `take` subscribes."""
+    """The newest image, for one thread at a time. The first `take` subscribes."""
 
     def __init__(self, link: Link, role: str, first: Channel = OVERLAY, secure: str = "") -> None:
         """Subscribe to the status, for the clock of the robot.
@@ -106,7 +106,7 @@ class Pictures:
         link.subscribe(STATUS, self._on_status)
 
     def take(self, timeout_s: float) -> Shot | None:
-        """Take the next image. Taking a frame acknowledges it.
+        """Take the next image. A frame is acknowledged.
 
         Args:
             timeout_s: longest wait, s.
@@ -133,16 +133,16 @@ class Pictures:
             self._newest = None
 
     def age_us(self, shot: Shot) -> int | None:
-        """Return the least possible age of the image by the robot's clock, us, or None before a status."""
+        """Return the lowest possible age of the image by the robot's clock, us, or None before a status."""
         return self.clock.age_us(shot.session, shot.t_us, monotonic_us())
 
     @property
     def is_online(self) -> bool:
-        """Return whether the robot publishes its status."""
+        """Return True if the robot publishes its status."""
         return time.monotonic() - self._status_s < SILENT_S
 
     def _choose(self) -> None:
-        """Subscribe to the wanted channel, and to frames while it is silent."""
+        """Subscribe to the wanted channel, and to frames while that channel is silent."""
         if self._first.name not in self._subscribed:
             self._received_s = time.monotonic()
             self._subscribe(self._first)
@@ -180,7 +180,7 @@ class Pictures:
             return None
         return Shot(message.channel, message.payload, *named, size.width_px, size.height_px)
 
-    # --- on the transport's thread: store and return -----------------------------------------------------------------
+    # --- on a thread of the transport: store and return --------------------------------------------------------------
 
     def _on_picture(self, message: Message) -> None:
         with self._changed:

@@ -27,7 +27,7 @@ STOP_PERIOD_S: Final = 0.05
 _KEPT_REPLIES = 64
 _RECENT_S: Final = 0.5  # five periods of a robot's status
 _CITES_STATUS = (Verb.ARM, Verb.RESET, Verb.ACQUIRE)
-"""Requests that permit motion must cite a status younger than two seconds; requests that end it need not."""
+"""Requests that permit motion, which must cite a status younger than two seconds. Other requests need not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +48,9 @@ def read_report(message: Message) -> StatusReport:
 
 
 class Operator:
-    """Sends an operator's requests to one robot. Every wait is bounded and raises LinkError without an answer.
+    """Sends an operator's requests to one robot. Every wait has a limit and raises LinkError without an answer.
 
-    Several threads may use it.
+    Thread-safe.
     """
 
     def __init__(self, link: Link) -> None:
@@ -66,7 +66,7 @@ class Operator:
         self._changed = threading.Condition()
         self._report: StatusReport | None = None
         self._recent: dict[str, tuple[float, Status]] = {}
-        """Newest status of each session, and its time: a second one is a restart, or another robot of this id."""
+        """Session -> newest status and its time. A second session is a restart, or another robot with this id."""
         self._twin_s = -math.inf
         self._reports = 0
         self._version_trouble = ""
@@ -112,7 +112,7 @@ class Operator:
 
         Args:
             verb: the request.
-            timeout_s: longest wait, s; for a verb that cites a status, once for the status and once for the reply.
+            timeout_s: longest wait, s. A verb that cites a status waits once for the status and once for the reply.
 
         Returns:
             The reply of the robot. `ok` is False for a rejection.
@@ -121,11 +121,11 @@ class Operator:
             LinkError: no reply in time.
         """
         if verb in _CITES_STATUS:
-            self.wait_report(timeout_s)  # a new one: the stored one may precede a STOP or disarm
+            self.wait_report(timeout_s)  # a new status, because the stored one may precede a STOP or disarm
         return self._request(verb, self._report, timeout_s)
 
     def _request(self, verb: Verb, cited: StatusReport | None, timeout_s: float) -> Reply:
-        """Repeats cite the same status, so that a STOP in between wins."""
+        """Send a request repeatedly with the same cited status, so that a STOP in between wins."""
         number, deadline_s = self._new_id(), time.monotonic() + timeout_s
         while time.monotonic() < deadline_s:
             self._send(number, verb, cited)
@@ -142,8 +142,8 @@ class Operator:
     def arm(self, patience_s: float = 5.0) -> Reply:
         """Request arming. Repeat it while a condition is missing (valid commands, wheels at zero).
 
-        A repeat cites a newer status. It is not sent if that shows another state or reason than the first one, because
-        another operator may have stopped the robot meanwhile.
+        A repetition cites a newer status. It is not sent if this status shows another state or reason than the first
+        one, because another operator may have stopped the robot meanwhile.
 
         Args:
             patience_s: time for the conditions, s.
@@ -152,7 +152,7 @@ class Operator:
             The last reply. `ok` is False if the robot did not arm.
 
         Raises:
-            LinkError: no answer from the robot, or two robots of this id.
+            LinkError: no answer from the robot, or two robots with this id.
         """
         deadline_s = time.monotonic() + patience_s
         first = seen = self.wait_report()
@@ -167,7 +167,7 @@ class Operator:
     def reset(self, patience_s: float = 1.5) -> Reply:
         """Request a reset. Repeat it while the wheels still turn.
 
-        Every repeat cites the same status, so a STOP in between wins.
+        Every repetition cites the same status, so a STOP in between wins.
 
         Args:
             patience_s: time for the wheels, s.
@@ -194,7 +194,7 @@ class Operator:
         Args:
             on_slow: called once if no status shows STOPPED after 300 ms.
             timeout_s: longest wait, s.
-            is_proven: whether the stop is proven in another way, which ends the repetition.
+            is_proven: returns True if the stop is proven in another way, which ends the repetition.
 
         Returns:
             The status that shows the stop, or None if `is_proven` returned True.
@@ -203,7 +203,7 @@ class Operator:
             LinkError: at `timeout_s`; the robot may still move.
         """
         number, started_s = self._new_id(), time.monotonic()
-        # The stored status may be from before a reset by another operator, on a link that is dead now.
+        # The stored status may be from before another operator's reset, on a link that is dead now.
         seen, warned = self._reports, False
         while time.monotonic() - started_s < timeout_s and not is_proven():
             self._send(number, Verb.STOP, None)
@@ -228,7 +228,7 @@ class Operator:
         return self._has_state_stopped() and all(one.applied == (0.0, 0.0) for _, one in self._recent.values())
 
     def _new_id(self) -> int:
-        with self._changed:  # a program may disarm in one thread while another one arms
+        with self._changed:  # two threads may send requests at the same time, e.g. arm and disarm
             self._id += 1
             return self._id
 
@@ -240,7 +240,7 @@ class Operator:
             header = RequestHeader(source=SOURCE, session=self._session, seq=self._seq, echo=echo)
         self._link.publish(REQUEST, encode(header), encode(Request(id=number, verb=verb)), SOURCE)
 
-    # --- on the transport's thread: store and return -------------------------------------------------------------
+    # --- on a thread of the transport: store and return ----------------------------------------------------------
 
     def _on_status(self, message: Message) -> None:
         try:
@@ -262,7 +262,7 @@ class Operator:
         self._recent = {one: known for one, known in self._recent.items() if now_s - known[0] < _RECENT_S}
         last = self._report.stamp.session if self._report else session
         if session in self._recent and session != last:
-            self._twin_s = now_s  # it came back after another one
+            self._twin_s = now_s  # this session returned after another one
         self._recent[session] = now_s, report.status
 
     def _on_reply(self, message: Message) -> None:

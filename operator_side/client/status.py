@@ -57,7 +57,7 @@ def short_lines(robot: str, status: Status) -> Iterator[str]:
 
 
 def next_step(robot: str, status: Status) -> str:
-    """Return the command with which an operator continues, or ""."""
+    """Return the operator's next command, or ""."""
     if status.state in (State.STOPPED, State.FAULT):
         return f"sightline reset {robot}"
     if status.state is State.DISARMED and not status.auto_arm:
@@ -91,7 +91,7 @@ def status_lines(robot: str, status: Status) -> Iterator[str]:
 
 
 def fault_lines(status: Status) -> Iterator[str]:
-    """Format the fault of the camera and the exceptions so far; nothing without them."""
+    """Format the fault of the camera and the exceptions so far; empty without both."""
     if status.stream.camera_fault:
         yield f"camera    {status.stream.camera_fault}"
     if status.faults:
@@ -104,7 +104,7 @@ def counts_text(counts: Mapping[str, int]) -> str:
 
 
 def stream_is_whole(stream: StreamStatus) -> bool:
-    """Return True if the robot sends the images as configured, because the link carries them in full."""
+    """Return True if the robot sends its images with the configured quality and size."""
     return stream.quality_percent == stream.scale_percent == 100
 
 
@@ -132,7 +132,7 @@ def rejections_text(status: Status) -> str:
 
 
 def twist_text(twist: tuple[float, float]) -> str:
-    """Format a twist in m/s and rad/s with signs, which show forward and left."""
+    """Format a twist in m/s and rad/s with signs: positive is forward and left."""
     return f"{twist[0]:+.2f} m/s {twist[1]:+.2f} rad/s"
 
 

@@ -1,8 +1,8 @@
-"""STOP of one robot by datagrams, and by its link if they are not answered soon, until one of both proves it.
+"""STOP of one robot by datagrams, and also by its link if they are not answered soon, until one proves the stop.
 Shell (threads).
 
-The datagrams go out first: opening a link can take seconds, or fail, while a flood occupies the ports of the links,
-and the libraries of a link take longer to import than all that a datagram needs.
+The datagrams are sent first. Opening a link can take seconds, or fail, while a flood occupies its ports. The libraries
+of a link also take longer to import than the modules of a datagram.
 """
 
 import os
@@ -24,38 +24,38 @@ if TYPE_CHECKING:
     from sightline.protocol.messages import Status
 
 Place = tuple[Any, ...]
-"""Address of a socket: host and port, with IPv6 also flow and scope."""
+"""Address of a socket: host and port, for IPv6 also flow and scope."""
 DATAGRAM_PERIOD_S: Final = 0.02
 _STORED_S: Final = 1.0
-"""Longest wait for the disk of a robot that is stopped, with its wheels at zero."""
+"""Longest wait for the disk of a stopped robot with its wheels at zero."""
 _ANSWERED_S: Final = 1.0
-"""Time for the answer to a datagram, if the link cannot be opened; and for the wheels, before the link opens too."""
+"""Wait for an answer to a datagram if the link cannot be opened; also the wait for the wheels before it is opened."""
 _LINK_CLOSES_S: Final = 0.3
 _RESOLVED_S: Final = 0.5
 """Longest wait for the addresses of a robot's name."""
 _RESOLVE_AGAIN_S: Final = 1.0
 _FIRST_S: Final = 0.05
-"""Time for the answer that the robot has applied a datagram, before the link is opened."""
+"""Wait for the answer that the robot has applied a datagram, before the link is opened."""
 
 
 class StopSender:
-    """Sends STOP datagrams to the ports beside `endpoints` until `close`. Use it in a `with`."""
+    """Sends STOP datagrams to the STOP ports of `endpoints` until `close`. Use it in a `with`."""
 
     def __init__(self, robot: str, endpoints: Sequence[str], secret_file: str = "") -> None:
-        """Start the thread that sends.
+        """Start the sending threads.
 
         Args:
             robot: robot id.
-            endpoints: of the robot or of its router, as for a link.
+            endpoints: endpoints of the robot or of its router, as for a link.
             secret_file: file of the STOP secret, or "" without keys.
         """
         self._robot, self._secret = robot, read_secret(secret_file)
         self._requests: list[StopRequests] = []
-        """One for each address: two hosts of one name have challenges of their own."""
+        """One for each address, because two hosts with one name have different challenges."""
         self._answered_s = 0.0
         self._ending = threading.Event()
         self._sent, self._latched = threading.Event(), threading.Event()
-        # One for each name: it may take seconds until a name server answers.
+        # One for each name, because a name server may take seconds.
         self._threads = [threading.Thread(target=self._run, args=(address,), name="stop datagrams", daemon=True)
                          for address in stop_addresses(endpoints)]
         for thread in self._threads:
@@ -82,7 +82,7 @@ class StopSender:
         return any(one.is_latched for one in self._requests)
 
     def wait(self, seconds: float) -> bool:
-        """Return True as soon as the robot has applied this STOP, False that time after the first datagrams."""
+        """Wait until the robot has applied this STOP. Returns False `seconds` after the first datagrams."""
         self._sent.wait(_RESOLVED_S)
         return self._latched.wait(seconds)
 
@@ -93,7 +93,7 @@ class StopSender:
 
     @property
     def denies_zero(self) -> bool:
-        """Return True if the robot answers that its wheels are not at zero, whatever the status on its link shows."""
+        """Return True if the robot answers that its wheels are not at zero. This overrides the status on its link."""
         return self.is_latched and not self.is_stopped and time.monotonic() - self._answered_s < _ANSWERED_S
 
     @property
@@ -103,7 +103,7 @@ class StopSender:
 
     @property
     def lacks_secret(self) -> bool:
-        """Return True if the robot accepts only datagrams that are signed with its STOP secret."""
+        """Return True if the robot accepts only datagrams with the HMAC of its STOP secret."""
         return any(one.lacks_secret for one in self._requests)
 
     @property
@@ -113,13 +113,13 @@ class StopSender:
 
     def _run(self, address: tuple[str, int]) -> None:
         while not (places := _resolve(address)):
-            self._sent.set()  # there is nothing to wait for
+            self._sent.set()  # no address, so nothing to wait for
             if self._ending.wait(_RESOLVE_AGAIN_S):
                 return
         with ExitStack() as ending:
             senders: dict[socket.socket, tuple[Place, StopRequests]] = {}
             for family, place in places:
-                with suppress(OSError):  # a system without IPv6
+                with suppress(OSError):  # the system has no IPv6
                     one = ending.enter_context(socket.socket(family, socket.SOCK_DGRAM))
                     senders[one] = place, StopRequests(self._robot, self._secret, int.from_bytes(os.urandom(8)) >> 2)
             self._requests += [requests for _, requests in senders.values()]
@@ -132,7 +132,7 @@ class StopSender:
     @staticmethod
     def _send(one: socket.socket, place: Place, requests: StopRequests) -> None:
         for data in requests.datagrams():
-            with suppress(OSError):  # e.g. no route at present
+            with suppress(OSError):  # e.g. no route now
                 one.sendto(data, place)
 
     def _receive(self, senders: Mapping[socket.socket, tuple[Place, StopRequests]], until_s: float) -> None:
@@ -151,7 +151,7 @@ class StopSender:
 
 
 def _resolve(address: tuple[str, int]) -> list[tuple[socket.AddressFamily, Place]]:
-    """Return the first place of each family: a name may have both, while its host listens on one only."""
+    """Return the first address of each family, because a name may have both while its host listens on one."""
     try:
         found = socket.getaddrinfo(*address, type=socket.SOCK_DGRAM)
     except (OSError, UnicodeError):
@@ -160,14 +160,14 @@ def _resolve(address: tuple[str, int]) -> list[tuple[socket.AddressFamily, Place
 
 
 class _LinkStop(threading.Thread):
-    """Opens the link and sends STOP there."""
+    """Opens the link and sends STOP on it."""
 
     def __init__(self, name: str, robot: str, connect: Sequence[str], secure: str, timeout_s: float) -> None:
         super().__init__(name=name, daemon=True)
         self._robot, self._connect, self._secure, self._timeout_s = robot, connect, secure, timeout_s
         self._operator: Operator | None = None
         self.ended = threading.Event()
-        """Set from outside: then no more STOP is sent here."""
+        """Set by the caller to end the sending of STOP."""
         self.status: Status | None = None
         self.error: SightlineError | None = None
 
@@ -199,7 +199,7 @@ def stop_robot(
     robot: str, connect: Sequence[str], secure: str, secret_file: str, on_slow: Callable[[], None], *,
     on_other_secret: Callable[[], None] = lambda: None, timeout_s: float = 10.0, thread_name: str = "stop link",
 ) -> bool:
-    """Stop a robot by datagrams, and by its link without an answer. Returns once it is STOPPED, its wheels at zero.
+    """Stop a robot by datagrams, and without an answer by its link. Returns when it is STOPPED with wheels at zero.
 
     Args:
         robot: robot id.

@@ -25,15 +25,15 @@ class DetectorMetrics:
         self._service = service
 
     def is_live(self) -> bool:
-        """Return True while the service turns and its detector ends each batch, and before it begins."""
+        """Return True while the loop runs and the detector ends each batch, and before the service begins."""
         return self._service is None or self._service.is_live()
 
     def is_ready(self) -> bool:
-        """Return True while frames would be answered, whether or not a robot is present."""
+        """Return True while frames would be answered, with or without a robot."""
         return self._service is not None and self._service.is_ready()
 
     def collect(self) -> Iterator[Family]:
-        """Yield the present metrics."""
+        """Yield the current metrics."""
         if self._service is None:
             return
         now = self._service.health()
@@ -55,7 +55,7 @@ class DetectorMetrics:
 
 @contextmanager
 def served(where: str) -> Iterator[Callable[[DetectorService], None]]:
-    """Serve at `[HOST:]PORT` while the block runs; yields the function that takes the service.
+    """Serve at `[HOST:]PORT` in this context. Yields the function that receives the service.
 
     Raises:
         ConfigError: the address is invalid.

@@ -1,6 +1,6 @@
 """The newest images of a robot, numbered, fetched only while a page requests them. Shell (a thread).
 
-A page requests the next image after it drew the last: a slow page gets fewer images, never older ones.
+A page requests the next image after it drew the last one. So a slow page gets fewer images, but not older ones.
 """
 
 import threading
@@ -14,9 +14,9 @@ from sightline.operator_side.client.pictures import Pictures, Shot
 from sightline.operator_side.cockpit.http_server import HttpAnswer, PageRequest
 
 IDLE_S: Final = 3.0
-"""A page without a request for this time is closed."""
+"""Time without a request after which a page counts as closed."""
 WAIT_S: Final = 1.0
-"""The longest wait for an image before a page repeats its request."""
+"""Longest wait for an image before a page repeats its request."""
 _TAKE_S: Final = 0.5
 
 
@@ -51,7 +51,7 @@ class FrameBuffer:
             return tuple(self._shots)
 
     def of(self, number: int) -> Shot | None:
-        """Return the image of that number, or None if it is gone."""
+        """Return the image with this number, or None if it is gone."""
         return next((one.shot for one in self.shots if one.number == number), None)
 
     def is_wanted(self, timeout_s: float) -> bool:
@@ -61,20 +61,20 @@ class FrameBuffer:
 
     @property
     def is_idle(self) -> bool:
-        """Return whether the last request is long ago."""
+        """Return True if the last request is too old."""
         return time.monotonic() - self._requested_s > IDLE_S
 
     def next(self, after: int, timeout_s: float = WAIT_S) -> Numbered | None:
-        """Wait for an image with a number above `after`; return the newest, or None at `timeout_s`."""
+        """Wait for an image with a number above `after`. Returns the newest one, or None at `timeout_s`."""
         with self._changed:
-            after = after if 0 <= after <= self._number else 0  # a page of an earlier run
+            after = after if 0 <= after <= self._number else 0  # the page is from an earlier run
             self._wanted, self._requested_s = max(self._wanted, after), time.monotonic()
             self._changed.notify_all()
             self._changed.wait_for(lambda: self._number > after, timeout_s)
             return self._shots[-1] if self._number > after else None
 
     def route(self, request: PageRequest, _body: bytes) -> HttpAnswer:
-        """Answer `GET /picture?after=N` with the next image, `?number=N` with that one; 204 without one."""
+        """Answer `GET /picture?after=N` with the next image, `?number=N` with image N; 204 without an image."""
         if "number" in request:
             shot = self.of(int(request["number"]))
             found = Numbered(int(request["number"]), shot) if shot else None
@@ -93,7 +93,7 @@ class FrameBuffer:
 
 
 def fill(buffer: FrameBuffer, pictures: Pictures, ending: threading.Event) -> None:
-    """Take images on request until `ending`; without requests, unsubscribe."""
+    """Take images on request until `ending`. Without requests it unsubscribes."""
     while not ending.is_set():
         if not buffer.is_wanted(_TAKE_S):
             if buffer.is_idle:

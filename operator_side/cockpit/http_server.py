@@ -1,7 +1,7 @@
 """A bounded HTTP server: pages for the operator on loopback, metrics at a chosen address. Shell (threads).
 
-It rejects requests of foreign sites: a request must name this machine as its host, and a request that changes
-something must come from the page itself.
+It rejects requests of third-party sites: the host of a request must be this machine, and a request with a change must
+come from the page itself.
 """
 
 import json
@@ -54,12 +54,12 @@ Route = Callable[[PageRequest, bytes], HttpAnswer]
 
 
 def as_json(value: Any, status: int = 200) -> HttpAnswer:
-    """Make a response of `value` as JSON."""
+    """Create a response with `value` as JSON."""
     return HttpAnswer(json.dumps(value).encode(), status=status)
 
 
 def page(name: str, **words: str) -> HttpAnswer:
-    """Make a response of a file in `operator_side/cockpit/pages`, with each `{{word}}` replaced by escaped text."""
+    """Create a response with a file of `operator_side/cockpit/pages`. Escaped texts replace each `{{word}}`."""
     text = files(__package__).joinpath("pages", name).read_text("utf-8")
     for word, value in words.items():
         text = text.replace("{{" + word + "}}", escape(value))
@@ -68,10 +68,10 @@ def page(name: str, **words: str) -> HttpAnswer:
 
 @contextmanager
 def served(routes: Mapping[str, Route], port: int, host: str = HOST, *, names: Sequence[str] = _NAMES) -> Iterator[str]:
-    """Serve `routes` ("GET /", "POST /pick" ...) while the block runs; yields the address. Port 0 takes a free one.
+    """Serve `routes` ("GET /", "POST /pick" ...) in this context. Yields the address. Port 0 selects a free port.
 
     Args:
-        names: host names that a request may use; none permits any, for public content.
+        names: host names that a request may use. An empty list permits all, for public content.
 
     Raises:
         LinkError: the port is in use.
@@ -95,7 +95,7 @@ def served(routes: Mapping[str, Route], port: int, host: str = HOST, *, names: S
 
 
 def _answered(route: Route, query: str, body: bytes) -> HttpAnswer:
-    """Call the route; turn an invalid request into an error response."""
+    """Call the route. Convert an invalid request to an error response."""
     try:
         return route(dict(parse_qsl(query, max_num_fields=_MAX_FIELDS)), body)
     except SightlineError as error:
@@ -105,11 +105,11 @@ def _answered(route: Route, query: str, body: bytes) -> HttpAnswer:
 
 
 class _Server(ThreadingMixIn, HTTPServer):
-    """Runs each connection in a thread, up to a limit; a silent one delays neither the others nor the end."""
+    """Runs each connection in a thread, up to a limit. A silent connection delays neither the others nor the end."""
 
     daemon_threads = True
     block_on_close = False
-    request_queue_size = MAX_CONNECTIONS  # a connection beyond the queue waits for a second to try again
+    request_queue_size = MAX_CONNECTIONS  # a client beyond the queue tries again after a second
 
     def __init__(self, address: tuple[str, int], handler: Any) -> None:
         self._places = threading.BoundedSemaphore(MAX_CONNECTIONS)
@@ -141,7 +141,7 @@ class _Server(ThreadingMixIn, HTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """One connection. Its class has the routes."""
+    """One connection. A subclass sets the routes."""
 
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "sightline", ""
@@ -164,7 +164,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer(self, method: str) -> None:
         rejection = self._rejection(method)
         if rejection is not None:
-            self.close_connection = True  # the body, if any, is not read
+            self.close_connection = True  # because a body would stay unread
             self._send(rejection)
             return
         path, _, query = self.path.partition("?")

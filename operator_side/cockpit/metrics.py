@@ -1,6 +1,6 @@
 """A robot's status as Prometheus metrics, and the probes of a supervisor. Shell (HTTP, a link).
 
-`prometheus_client` writes the format, since the Prometheus project maintains it.
+`prometheus_client` writes the format, because the Prometheus project maintains it.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ class Exposed(Protocol):
     """A source of metrics."""
 
     def collect(self) -> Iterator[Family]:
-        """Yield the present metrics."""
+        """Yield the current metrics."""
         ...
 
     def is_live(self) -> bool:
-        """Return False if the process hangs and must be started again."""
+        """Return False if the process hangs and must be restarted."""
         ...
 
     def is_ready(self) -> bool:
-        """Return True if it does its work."""
+        """Return True if the service works."""
         ...
 
 
 def gauge(name: str, about: str, values: dict[tuple[str, ...], float], *labels: str) -> GaugeMetricFamily:
-    """Make a gauge with a value for each combination of labels."""
+    """Create a gauge with a value for each combination of labels."""
     from prometheus_client.core import GaugeMetricFamily
 
     family = GaugeMetricFamily(f"sightline_{name}", about, labels=labels)
@@ -53,7 +53,7 @@ def gauge(name: str, about: str, values: dict[tuple[str, ...], float], *labels: 
 
 
 def counter(name: str, about: str, values: dict[tuple[str, ...], float], *labels: str) -> CounterMetricFamily:
-    """Make a counter with a value for each combination of labels."""
+    """Create a counter with a value for each combination of labels."""
     from prometheus_client.core import CounterMetricFamily
 
     family = CounterMetricFamily(f"sightline_{name}", about, labels=labels)
@@ -64,7 +64,7 @@ def counter(name: str, about: str, values: dict[tuple[str, ...], float], *labels
 
 @contextmanager
 def serving(exposed: Exposed, host: str, port: int) -> Iterator[str]:
-    """Serve `/metrics`, `/live` and `/ready` while the block runs; yields the address.
+    """Serve `/metrics`, `/live` and `/ready` in this context. Yields the address.
 
     `/health` is the former name of `/ready`. Raises LinkError for a port in use.
     """
@@ -93,7 +93,7 @@ def serving(exposed: Exposed, host: str, port: int) -> Iterator[str]:
 
 
 FRESH_S: Final = 2.0
-"""A robot without a status for this time is down."""
+"""Time without a status after which a robot is down."""
 
 
 _COUNTERS: Final = {
@@ -109,7 +109,7 @@ _COUNTERS: Final = {
     "dropped": "messages_dropped",
     "faults": "faults",
 }
-"""Fields of a status that only count up -> names of their metrics. Every other number is a gauge of its own name."""
+"""Fields of a status that never decrease -> names of their metrics. Every other number is a gauge with its own name."""
 _LABELS: Final = {"refused": "reason", "dropped": "channel", "faults": "part"}
 _GAUGES: Final = {"fps": "stream_fps", "window": "stream_window"}
 
@@ -139,7 +139,7 @@ class Watched:
         return newest[0] if newest is not None and time.monotonic() - newest[1] <= FRESH_S else None
 
     def is_live(self) -> bool:
-        """Return True: this process only waits."""
+        """Return True, because this process only waits."""
         return True
 
     def is_ready(self) -> bool:
@@ -147,7 +147,7 @@ class Watched:
         return self.fresh() is not None
 
     def collect(self) -> Iterator[Family]:
-        """Yield the present metrics; of a silent robot only `sightline_up`."""
+        """Yield the current metrics; for a silent robot only `sightline_up`."""
         status = self.fresh()
         yield self._gauge("up", "whether the robot publishes its status", float(status is not None))
         if status is not None:
@@ -164,7 +164,7 @@ class Watched:
                             {(): self._entered[State.HOLD.value]})
 
     def _fields(self, part: Status | StreamStatus) -> Iterator[Family]:
-        """Yield every number in `part` with the description of its field; times in seconds."""
+        """Yield every number in `part` with the description of its field. Times are in seconds."""
         for field, info in type(part).model_fields.items():
             value, about = getattr(part, field), info.description or ""
             if isinstance(value, StreamStatus):
@@ -180,7 +180,7 @@ class Watched:
                 yield self._gauge(_GAUGES.get(field, field), about, float(value))
 
     def _round_trip(self) -> Iterator[Family]:
-        """Query the robot's network process at each collection; yield nothing on a link without queries."""
+        """Query the robot's network process at each collection. Yields nothing on a link without queries."""
         for peer in self._peers():
             if peer.presence.role == ROBOT_ROLE and peer.presence.robot == self._robot:
                 yield self._gauge("round_trip_seconds", "there and back on the link", peer.round_trip_us / 1e6)

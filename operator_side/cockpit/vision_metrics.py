@@ -26,7 +26,7 @@ class VisionMetrics:
     def __init__(self) -> None:
         self._state: ServingState | None = None
         self._busy: tuple[float, dict[str, int]] = (0.0, {})
-        """Time of the newest scrape, and how long each robot's frames had been answered by then."""
+        """Time of the newest scrape, and the busy time of each robot's service at that time."""
 
     def look_at(self, state: ServingState) -> None:
         """Use `state` as the source."""
@@ -38,11 +38,11 @@ class VisionMetrics:
         return self._state is None or self._state.is_live
 
     def is_ready(self) -> bool:
-        """Return True while new robots may come, whether or not a robot is present."""
+        """Return True while new robots are served, with or without a robot."""
         return self._state is not None and self._state.is_ready
 
     def collect(self) -> Iterator[Family]:
-        """Yield the present metrics of each robot."""
+        """Yield the current metrics of each robot."""
         rows = self._state.counts() if self._state else []
 
         def each(value: Callable[[ServiceCounts], float]) -> dict[tuple[str, ...], float]:
@@ -83,14 +83,14 @@ class VisionMetrics:
         threads: Counter[int] = Counter()
         for one in rows:
             earlier_us = before.get(one.robot, 0)
-            # A service that was started again counts from 0.
+            # The counters of a restarted service begin at 0.
             threads[one.thread] += one.busy_us - (earlier_us if earlier_us <= one.busy_us else 0)
         return min(1.0, max(threads.values(), default=0) / 1e6 / max(1e-6, now_s - before_s))
 
 
 @contextmanager
 def served(where: str) -> Iterator[Observe]:
-    """Serve at `[HOST:]PORT` while the block runs; yields the function that takes the source of the counters.
+    """Serve at `[HOST:]PORT` in this context. Yields the function that receives the source of the counters.
 
     Raises:
         ConfigError: the address is invalid.
@@ -102,7 +102,7 @@ def served(where: str) -> Iterator[Observe]:
 
 
 def listening_address(where: str) -> tuple[str, int]:
-    """Return host and port of `[HOST:]PORT`. Raises ConfigError for an invalid one."""
+    """Return host and port of `[HOST:]PORT`. Raises ConfigError for an invalid text."""
     match = _WHERE.fullmatch(where)
     if match is None or not 1 <= int(match[2]) <= 65_535:
         raise ConfigError(f"invalid --metrics '{where}': expected PORT or HOST:PORT, e.g. 9465 or 0.0.0.0:9465")

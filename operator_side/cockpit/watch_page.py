@@ -14,12 +14,12 @@ from sightline.protocol.channels import Channel
 from sightline.protocol.messages import Status
 from sightline.protocol.transports.link import Link
 
-_SHOWN_PICTURES = 2  # the newest, and the one before for a second page
+_SHOWN_PICTURES = 2  # the newest image, and the one before for a second page
 
 
 @contextmanager
 def watch_page(link: Link, role: str, first: Channel, port: int, secure: str) -> Iterator[str]:
-    """Serve the page while the block runs; yields its address. Raises LinkError for a port in use."""
+    """Serve the page in this context. Yields its address. Raises LinkError for a port in use."""
     pictures, missions, ending = Pictures(link, role, first, secure), MissionClient(link), threading.Event()
     buffer = FrameBuffer(_SHOWN_PICTURES, pictures.age_us)
 
@@ -43,7 +43,8 @@ def watch_page(link: Link, role: str, first: Channel, port: int, secure: str) ->
 
 
 def state_of(robot: str, missions: MissionClient, is_online: bool) -> dict[str, Any]:
-    """Return the text next to the image. A silent robot, `is_online` is False, has none: its last state is over."""
+    """Return the text next to the image. It is empty for a silent robot (`is_online` is False), whose state is unknown.
+    """
     report = missions.operator.report if is_online else None
     lines = _robot_lines(report.status) if report is not None else []
     mission = missions.newest(0.0)

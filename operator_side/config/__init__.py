@@ -1,5 +1,5 @@
-"""The configuration of a service: read, checked, explained and written.
+"""The configuration of a service: loaded, validated, explained and written.
 
 May import: `protocol`, the configuration models of the sides.
-Interface: `loading` makes a model from file, environment and `--set`; `errors` makes one line of a problem.
+Interface: `loading` creates a model from file, environment and `--set`; `errors` formats a problem as one line.
 """

@@ -1,7 +1,7 @@
 """The robot address that a client command uses: its option, SIGHTLINE_CONNECT, the saved context, or the default.
 Shell (files).
 
-`sightline use` saves the context. The robot, the vision service and the router never read it.
+`sightline use` saves the context. Robot, vision service and router never read it.
 """
 
 import os
@@ -29,7 +29,7 @@ class Context(NamedTuple):
 
 
 class RobotAddress(NamedTuple):
-    """The robot that a command addresses, and where the address came from."""
+    """The robot that a command addresses, and the source of its address."""
 
     robot: str
     connect: tuple[str, ...]
@@ -43,9 +43,9 @@ class RobotAddress(NamedTuple):
 def find_address(
     environ: Mapping[str, str], robot: str | None, connect: Sequence[str] | None, secure: str = ""
 ) -> RobotAddress:
-    """Find the address of a client command.
+    """Find the address for a client command.
 
-    The context's robot id and keys apply only together with its address.
+    The context's robot id and keys are used only together with its address.
 
     Args:
         environ: environment of the process.
@@ -56,7 +56,7 @@ def find_address(
     Raises:
         ConfigError: SIGHTLINE_CONNECT or the context file is invalid.
     """
-    robot_id = DEFAULT_ROBOT if robot is None else robot  # "" is an unset variable of a script, and invalid
+    robot_id = DEFAULT_ROBOT if robot is None else robot  # "" comes from an unset variable of a script, and is invalid
     if connect:
         return RobotAddress(robot_id, tuple(connect), secure, "--connect")
     if environ.get(CONNECT_VARIABLE):
@@ -75,7 +75,7 @@ def target_of(robot: str | None, connect: list[str] | None, secure: str, *, anno
 
     Args:
         robot, connect, secure: values of the options, as given.
-        announce: whether to print address and origin on stderr, for commands that move a robot.
+        announce: True to print address and source on stderr, for commands that move a robot.
     """
     target = find_address(os.environ, robot, connect, secure)
     check_robot_id(target.robot)
@@ -87,7 +87,7 @@ def target_of(robot: str | None, connect: list[str] | None, secure: str, *, anno
 
 
 def stop_secret_of(target: RobotAddress, warn: Callable[[str], None]) -> str:
-    """Return the file of the STOP secret; warn with one line where the keys lack it."""
+    """Return the file of the STOP secret. Warns with one line if the keys do not contain it."""
     try:
         return stop_secret_file(target.secure) if target.secure else ""
     except ConfigError as error:
@@ -103,9 +103,9 @@ def _from_variable(text: str) -> tuple[str, ...]:
 
 
 def context_path(environ: Mapping[str, str]) -> Path | None:
-    """Return the path of the context file; None where the user has no home folder."""
+    """Return the path of the context file, or None if the user has no home folder."""
     folder = environ.get("XDG_CONFIG_HOME", "")
-    if Path(folder).is_absolute():  # the XDG specification ignores a relative one
+    if Path(folder).is_absolute():  # the XDG specification ignores relative paths
         return Path(folder) / "sightline/context.toml"
     try:
         return Path("~/.config/sightline/context.toml").expanduser()
@@ -122,7 +122,7 @@ def shown(path: Path | None) -> str:
 
 
 def read_context(path: Path) -> Context | None:
-    """Read the context file; None if it is missing. Raises ConfigError for a damaged or unreadable one."""
+    """Read the context file. None if it is missing. Raises ConfigError for a damaged or unreadable file."""
     import tomllib
 
     from sightline.operator_side.config.toml_text import parse_toml
@@ -160,7 +160,7 @@ def _check(check: Any, value: str, place: str, fix: str) -> None:
 
 
 def write_context(path: Path, context: Context) -> None:
-    """Save the context: the file changes as a whole or not at all. Raises ConfigError if it cannot be written."""
+    """Save the context atomically. Raises ConfigError if the file cannot be written."""
     import tempfile
 
     from sightline.operator_side.config.toml_text import toml_text

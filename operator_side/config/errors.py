@@ -13,7 +13,7 @@ Key = tuple[str, ...]
 
 
 def known_keys(model: type[BaseModel]) -> Iterator[Key]:
-    """Yield every key of `model` that holds a value, without tables."""
+    """Yield every key of `model` with a value, without tables."""
     for name, field in model.model_fields.items():
         inner = table_of(field.annotation)
         if inner is None:
@@ -23,7 +23,7 @@ def known_keys(model: type[BaseModel]) -> Iterator[Key]:
 
 
 def is_known(model: type[BaseModel], key: Key) -> bool:
-    """Return whether `key` names a value or a table of `model`, or any key below a free-form table."""
+    """Return True if `key` names a value or table of `model`, or is below a free-form table."""
     field = model.model_fields.get(getattr(model, "renamed_keys", {}).get(key[0], key[0]))
     if field is None:
         return False
@@ -34,7 +34,7 @@ def is_known(model: type[BaseModel], key: Key) -> bool:
 
 
 def wrong_type(model: type[BaseModel], key: Key, value: Any) -> str:
-    """Describe a value of a file that pydantic would convert to another type without a word: true to 1, 1 to true."""
+    """Describe a value of a file that pydantic would silently convert to another type: true to 1, 1 to true."""
     wanted = _types_of(model, key)
     if isinstance(value, bool):
         is_wrong = bool not in wanted and bool(wanted & {int, float})
@@ -44,7 +44,7 @@ def wrong_type(model: type[BaseModel], key: Key, value: Any) -> str:
 
 
 def _types_of(model: type[BaseModel], key: Key) -> set[Any]:
-    """Return the types of the value at `key`; none for an unknown key and for one of a free-form table."""
+    """Return the types of the value at `key`; empty for an unknown key or a key in a free-form table."""
     field = model.model_fields.get(getattr(model, "renamed_keys", {}).get(key[0], key[0]))
     if field is None:
         return set()
@@ -55,7 +55,7 @@ def _types_of(model: type[BaseModel], key: Key) -> set[Any]:
 
 
 def is_free_form(annotation: Any) -> bool:
-    """Return whether a field is a table of a plug-in's own options."""
+    """Return True if a field is a table with the options of a plug-in."""
     return get_origin(annotation) is dict
 
 
@@ -69,7 +69,7 @@ def table_of(annotation: Any) -> type[BaseModel] | None:
 
 
 def allowed(model: type[BaseModel], key: Key) -> str:
-    """Describe the values that `key` accepts; "" without a simple bound."""
+    """Describe the values that `key` accepts; "" without a simple limit."""
     schema = model.model_json_schema()
     node: Any = schema
     for name in key:
@@ -107,7 +107,7 @@ _MOST_NAMES = 12
 
 
 def no_such_name(kind: str, name: str, names: Iterable[str]) -> str:
-    """Report that `name` is not in `names`, with the nearest of them, or with the first of them."""
+    """Report that `name` is not in `names`, with the nearest name or the first names."""
     names = list(names)
     nearest = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     shown = [*names[:_MOST_NAMES], *([f"and {len(names) - _MOST_NAMES} more"] if len(names) > _MOST_NAMES else [])]
@@ -118,9 +118,9 @@ def no_such_name(kind: str, name: str, names: Iterable[str]) -> str:
 def explain(
     model: type[BaseModel], error: ValidationError, typed: Callable[[Key], Key], label: Callable[[Key], str]
 ) -> str:
-    """Describe the first problem in full, with the number of the others.
+    """Describe the first problem in full, with the number of other problems.
 
-    `typed` completes an unknown key to the one given below it; `label` names a key as it was written.
+    `typed` completes an unknown key to the given key below it. `label` names a key as it was written.
     """
     problems = error.errors(include_url=False)
     first = problems[0]
@@ -143,7 +143,7 @@ def _problem(model: type[BaseModel], key: Key, problem: Any) -> str:
 
 
 def _shown(value: Any) -> str:
-    """Format a value as it stands in TOML or JSON, not as Python does."""
+    """Format a value as in TOML or JSON, not as in Python."""
     is_plain = isinstance(value, str) or (isinstance(value, float) and not math.isfinite(value))
     text = (f"'{value}'" if isinstance(value, str) else str(value)) if is_plain else json.dumps(value, default=str)
     return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 3] + "..."

@@ -27,7 +27,7 @@ from sightline.protocol.transports.endpoints import check_endpoint, check_robot_
 SERVICES: Final = ("robot", "vision", "sim")
 ENV_PREFIX: Final = "SIGHTLINE_"
 OTHER_ENV_NAMES: Final = ("SIGHTLINE_DEBUG", LOG_FORMAT_VARIABLE, CONNECT_VARIABLE)
-"""Names that services accept and do not read as configuration; CONNECT_VARIABLE is for client commands."""
+"""Names that services accept but do not read as configuration; CONNECT_VARIABLE is for client commands."""
 PROFILES: Final = Path(__file__).parent / "profiles"
 
 Key = tuple[str, ...]
@@ -35,7 +35,7 @@ Key = tuple[str, ...]
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """One given value. `text` is the typed text, if it was typed; `origin` names the source."""
+    """One given value. `text` is the original text of an option or variable; `origin` names the source."""
 
     key: Key
     value: Any
@@ -45,7 +45,7 @@ class Given:
 
 @dataclass(frozen=True, slots=True)
 class Loaded:
-    """A checked configuration and the origin of its values."""
+    """A validated configuration, and the origin of its values."""
 
     service: str
     config: Config
@@ -84,11 +84,11 @@ def load(
     environ: Mapping[str, str],
     implied: Sequence[Given] = (),
 ) -> Loaded:
-    """Merge all sources and check the result.
+    """Merge all sources and validate the result.
 
     Args:
         options: dotted keys and values; None means not given.
-        implied: values that others imply; every source replaces them.
+        implied: values that follow from others; every source overrides them.
 
     Raises:
         ConfigError: names the key, the value, its origin and the permitted values.
@@ -110,7 +110,7 @@ def load(
 
 
 def given_at(given: Mapping[Key, Given], key: Key) -> Given | None:
-    """Return the value given for `key`, or for the list around it."""
+    """Return the value given for `key`, or for the table or list that contains it."""
     for length in range(len(key), 0, -1):
         if key[:length] in given:
             return given[key[:length]]
@@ -142,7 +142,7 @@ def _from_file(file: str, origin: str) -> Iterable[Given]:
 
 
 def _decimal_hint(file: str, error: Exception) -> str:
-    """Return the fix of a number with a decimal comma in the line of the error, or an empty text."""
+    """Return the fix for a number with a decimal comma in the line of the error, or an empty text."""
     place = re.search(r"at line (\d+)", str(error))
     lines = home_path(file).read_text("utf-8").splitlines() if place else []
     found = re.search(r"=\s*(-?\d+),(\d+)\s*(#|$)", lines[int(place[1]) - 1]) if place and lines else None
@@ -189,7 +189,7 @@ def _from_options(options: Mapping[str, Any]) -> Iterable[Given]:
 
 
 def _put(given: dict[Key, Given], one: Given) -> None:
-    """Store a value in place of an older one at the same key, above it or below it."""
+    """Store a value. It replaces older values at the same key, above it or below it."""
     key = one.key
     for other in [old for old in given if old[: len(key)] == key or key[: len(old)] == old]:
         del given[other]
@@ -205,11 +205,11 @@ def _check_service(given: Mapping[Key, Given], service: str, file: str | None) -
 
 
 def _check_names(given: Mapping[Key, Given], service: str) -> None:
-    """Check robot id and endpoints here, for a clearer error than a pattern gives."""
-    robot = given.get(("robot",)) if service != "sim" else None  # there it names the robot model
+    """Check robot id and endpoints here, for a clearer error than that of a pattern."""
+    robot = given.get(("robot",)) if service != "sim" else None  # for sim it names the robot model
     robot_id = None if robot is None else robot.value if isinstance(robot.value, str) else robot.text
     if robot_id is not None:
-        # A vision service may name several by `*` and `?`.
+        # A vision service may name several robots with `*` and `?`.
         plain_id = robot_id.replace("*", "x").replace("?", "x") if service == "vision" else robot_id
         with _labeled(given, ("robot",)):
             check_robot_id(plain_id)
@@ -249,7 +249,7 @@ def _validated(model: type[Config], given: dict[Key, Given]) -> Config:
 
 
 def _tree(model: type[Config], given: Mapping[Key, Given]) -> dict[str, Any]:
-    """Lay the given values over the defaults, so that one key of a table does not change the others."""
+    """Merge the given values over the defaults, so that one key of a table does not change the others."""
     tree = model().model_dump()
     for key, one in given.items():
         table = tree
@@ -262,7 +262,7 @@ def _tree(model: type[Config], given: Mapping[Key, Given]) -> dict[str, Any]:
 
 
 def _reread_typed_text(given: dict[Key, Given], error: ValidationError) -> bool:
-    """Use typed text as text where TOML read it as another type (`--set robot=1`, a single endpoint)."""
+    """Use a value as text if TOML parsed it as another type (`--set robot=1`, a single endpoint)."""
     changed = False
     for problem in error.errors(include_url=False, include_context=False):
         key = tuple(str(part) for part in problem["loc"])
@@ -279,12 +279,12 @@ def _reread_typed_text(given: dict[Key, Given], error: ValidationError) -> bool:
 
 
 def _typed(given: Mapping[Key, Given], key: Key) -> Key:
-    """Return the key as it was given, where the error names only its table."""
+    """Return the key as it was given, if the error names only its table."""
     return next((typed for typed in given if typed[: len(key)] == key), key)
 
 
 def _label(given: Mapping[Key, Given], key: Key) -> str:
-    """Name `key` as and where it was written; for a missing one, name the file of its neighbors."""
+    """Name `key` and its source as written; for a missing key, name the file of its neighbors."""
     one, dotted = given_at(given, key), ".".join(key)
     if one is None:
         beside = (one.origin for at, one in given.items() if len(key) > 1 and at[: len(key) - 1] == key[:-1])
@@ -295,7 +295,7 @@ def _label(given: Mapping[Key, Given], key: Key) -> str:
     return one.origin if one.origin.startswith((ENV_PREFIX, "--")) else f"{one.origin}: {dotted}"
 
 
-# --- the configuration of a service: the given values, and the values that they imply ----------------------------
+# --- the configuration of a service: the given values, and values that follow from them --------------------------
 
 
 def load_service(
@@ -307,7 +307,7 @@ def load_service(
     sets: Sequence[str] = (),
     options: Mapping[str, Any] | None = None,
 ) -> Loaded:
-    """Load a configuration with the values that others imply. Raises ConfigError as `load` does."""
+    """Load a configuration with the values that follow from others. Raises ConfigError as `load` does."""
     given: dict[str, Any] = {
         "profile": profile, "file": file, "sets": sets, "options": options, "environ": environ,
     }
@@ -317,7 +317,8 @@ def load_service(
 
 
 def _implied(loaded: Loaded) -> Iterator[Given]:
-    """Yield the implied values: a robot that connects need not listen, nor a vision service that listens connect."""
+    """Yield implied values: a robot that connects need not listen, and a vision service that listens need not connect.
+    """
     service = loaded.service
     listens, connects = (loaded.origin((name,)) != "default" for name in ("listen", "connect"))
     if service == "robot" and connects and not listens:

@@ -1,4 +1,4 @@
-"""Reads one TOML value from an option's text, and writes a table as TOML with the origin of each value. Pure."""
+"""Parses a TOML value from an option's text, and writes a table as TOML with the origin of each value. Pure."""
 
 import json
 import tomllib
@@ -11,7 +11,7 @@ Key = tuple[str, ...]
 
 
 def options_of(texts: Iterable[str], option: str = "--set", example: str = "linear_mps=0.2") -> dict[str, Any]:
-    """Read the KEY=VALUE texts of one option. Raises ConfigError that shows `example`."""
+    """Parse the KEY=VALUE texts of one option. Raises ConfigError that shows `example`."""
     return {key: toml_value(value) for key, value in (key_and_text(text, option, example) for text in texts)}
 
 
@@ -24,7 +24,7 @@ def key_and_text(text: str, option: str, example: str) -> tuple[str, str]:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Parse TOML. Raises tomllib.TOMLDecodeError, also for what Python cannot read or print again."""
+    """Parse TOML. Raises tomllib.TOMLDecodeError, also for a value that Python cannot read or print."""
     try:
         table = tomllib.loads(text)
         json.dumps(table, default=str)  # a hexadecimal number may be too long to print
@@ -37,7 +37,7 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def toml_value(text: str) -> Any:
-    """Read `text` as one TOML value; text that is not TOML is itself the value."""
+    """Parse `text` as one TOML value. Text that is not TOML is the value itself."""
     try:
         table = parse_toml(f"value = {text}")
     except tomllib.TOMLDecodeError:
@@ -46,12 +46,13 @@ def toml_value(text: str) -> Any:
 
 
 def toml_text(table: Mapping[str, Any], comment: Callable[[Key], str] = lambda _key: "") -> str:
-    """Format `table` (JSON types) as TOML. None becomes a comment, since TOML lacks it; `comment` adds one to a key."""
+    """Format `table` (JSON types) as TOML. None becomes a comment, because TOML has no null. `comment` adds comments.
+    """
     return "\n".join(_lines(table, (), comment)).strip() + "\n"
 
 
 def _lines(table: Mapping[str, Any], above: Key, comment: Callable[[Key], str]) -> Iterator[str]:
-    """Yield values first, then tables, as TOML requires."""
+    """Yield first values, then tables, as TOML requires."""
     for name, value in table.items():
         if not isinstance(value, dict):
             remark = comment((*above, name))
@@ -76,5 +77,5 @@ def _value(value: Any) -> str:
 
 
 def _text(text: str) -> str:
-    """Quote `text` as JSON does, and escape DEL, which TOML requires."""
+    """Quote `text` as in JSON, and escape DEL, as TOML requires."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007F")

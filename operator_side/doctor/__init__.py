@@ -1,4 +1,4 @@
-"""`sightline doctor`: what is wrong on this machine, and between it and a robot, each with the line that fixes it.
+"""`sightline doctor`: problems of this machine, and of its link to a robot, each with its fix.
 
 May import: `protocol`, `robot_side`, `operator_side`.
 Interface: `machine` and `network` return findings.

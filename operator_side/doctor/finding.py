@@ -1,4 +1,4 @@
-"""One finding of the doctor, with the command that fixes it. Pure."""
+"""One result of the doctor, with the command that fixes it. Pure."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sightline.protocol.errors import SightlineError
 
 @dataclass(frozen=True)
 class Finding:
-    """`value` is the result, `ok` is None for plain information, `fix` is the exact line that fixes it."""
+    """`value` is the result, `ok` is None for plain information, `fix` is the exact command of the fix."""
 
     name: str
     ok: bool | None
@@ -21,7 +21,7 @@ class Finding:
 
     @property
     def line(self) -> str:
-        """Format the finding as one line, with its fix on the next."""
+        """Format the finding as one line, with its fix on the next line."""
         sign = {True: "ok  ", False: "BAD ", None: "    "}[self.ok]
         fix = f"\n{'':25}fix: {self.fix}" if self.fix and self.ok is not True else ""
         unit = f" {self.unit}" if self.unit else ""
@@ -29,13 +29,13 @@ class Finding:
 
     @property
     def check(self) -> dict[str, Any]:
-        """Return the finding for scripts: a value with a unit is a number; a good one has no fix."""
+        """Return the finding for scripts. A value with a unit is a number. A good finding has no fix."""
         numbers = {name: _number(getattr(self, name)) for name in ("value", "bound") if self.unit}
         return {**asdict(self), **numbers, "fix": "" if self.ok is True else self.fix}
 
 
 def trouble(name: str, error: SightlineError) -> Finding:
-    """Make a finding of an error, whose fix follows its last semicolon."""
+    """Convert an error to a finding. The fix follows the last semicolon."""
     what, _, fix = str(error).rpartition("; ")
     return Finding(name, False, what or fix, fix if what else "")
 
@@ -48,12 +48,12 @@ def _number(text: str) -> float | str | None:
 
 
 def as_object(findings: list[Finding]) -> dict[str, Any]:
-    """Return the object of every command with checks for --json."""
+    """Return the --json object of a command with checks."""
     return {"ok": all(one.ok is not False for one in findings), "checks": [one.check for one in findings]}
 
 
 def histogram(values_ms: list[float], bins: int = 8, width: int = 40) -> list[str]:
-    """Draw `values_ms` as lines of text: lower end of the bin, bar, count. No values give no lines."""
+    """Draw `values_ms` as lines of text: lower end of the bin, bar, count. Empty without values."""
     if not values_ms:
         return []
     low, high = min(values_ms), max(values_ms)

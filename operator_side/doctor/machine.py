@@ -70,7 +70,7 @@ def _version(distribution: str) -> str:
 
 
 def _collision() -> Finding:
-    """Check for another distribution with our package name: `sightline` on the index is another project."""
+    """Check for another distribution with this package name: `sightline` on the index is another project."""
     owners = metadata.packages_distributions().get("sightline", ())
     others = sorted(set(owners) - {"sightline-robot"})
     fix = f"pip uninstall {' '.join(others)}, or install Sightline in a separate environment: python3 -m venv .venv"
@@ -90,7 +90,7 @@ def _port(port: int, what: str) -> Finding:
 
 
 def _real_time() -> Finding:
-    """Request real-time priority and return it, since limits and capabilities differ between systems."""
+    """Request real-time priority and report the result, because limits and capabilities differ between systems."""
     before = os.sched_getscheduler(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
@@ -128,7 +128,7 @@ def _temperature() -> Iterator[Finding]:
 
 
 def _slowed_down() -> Iterator[Finding]:
-    """Yield the time that heat, a quota or a host took from this machine since its start."""
+    """Yield the time that this machine lost to heat, a quota or a host since its start."""
     counts = [_text(file) for file in CPUS.glob("cpu[0-9]*/thermal_throttle/core_throttle_count")]
     hot = sum(int(text) for text in counts if text.isdigit())
     if counts:
@@ -156,7 +156,7 @@ def _power_save() -> Iterator[Finding]:
 
 
 def _multicast() -> Finding:
-    """Check that a multicast datagram returns to its sender; discovery needs it, explicit endpoints do not."""
+    """Check that a multicast datagram returns to its sender. Discovery needs it, explicit endpoints do not."""
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
             receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -223,7 +223,7 @@ DEVICES: Final = Path("/dev")
 _MEASURED_S: Final = 3.0
 _ENOUGH: Final = 0.9
 _ENUM_FMT: Final = 0xC0405602
-"""The kernel's VIDIOC_ENUM_FMT: read and write, 64 bytes, 'V', 2 (linux/videodev2.h)."""
+"""VIDIOC_ENUM_FMT of the kernel: read and write, 64 bytes, 'V', 2 (linux/videodev2.h)."""
 _FORMAT: Final = struct.Struct("III32sII12x")
 """v4l2_fmtdesc: index, type, flags, description, pixel format, bus code."""
 _CAPTURE: Final = 1
@@ -235,7 +235,7 @@ _UNOPENED: Final = {
 
 
 def modes() -> Iterator[Finding]:
-    """Yield the formats of each camera device of this machine; a device without formats is skipped."""
+    """Yield the formats of each camera device of this machine. A device without formats is skipped."""
     for device in sorted(DEVICES.glob("video[0-9]*")):
         try:
             offered = formats(device)
@@ -271,7 +271,7 @@ def _format(handle: int, index: int) -> str:
     query = _FORMAT.pack(index, _CAPTURE, 0, b"", 0, 0)
     try:
         answer = fcntl.ioctl(handle, _ENUM_FMT, query)
-    except OSError:  # the end of the list, or not a camera
+    except OSError:  # the end of the list, or the device is not a camera
         return ""
     return read_format(answer)
 
@@ -283,7 +283,7 @@ def read_format(answer: bytes) -> str:
 
 
 def delivered(kind: str, sets: list[str]) -> Finding:
-    """Measure the rate that a camera delivers of its option `fps`, if it has one, or report its error."""
+    """Measure the frame rate of a camera against its option `fps`, if it has one, or report its error."""
     from sightline.operator_side.calibrate.local_camera import camera_choice, local_camera
     from sightline.robot_side.plugins import CAMERAS
 

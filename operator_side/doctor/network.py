@@ -31,7 +31,7 @@ _PROBES = 40
 _PATIENCE_S = 2.0
 _LISTEN_S = 3.0
 _QUICK_MS = 60.0
-"""A round trip above this takes speed from a robot: its full limit ends at 150 ms of frame age."""
+"""A longer round trip reduces the speed of a robot: full speed ends at 150 ms of frame age."""
 _UNREACHED = {
     errno.ECONNREFUSED: "the machine answers, but the port is closed: start `sightline robot` there with --listen",
     errno.EHOSTUNREACH: "no route: another network, or the access point isolates its clients (client isolation)",
@@ -40,7 +40,7 @@ _UNREACHED = {
 
 
 def findings(endpoint: str, robot: str, secure: str) -> Iterator[Finding]:
-    """Yield the findings about the link to `endpoint`, and about the stream of a robot there."""
+    """Yield the findings about the link to `endpoint`, and about the stream of the robot there."""
     transport, host, port = _address(endpoint)
     if transport not in endpoints.OVER_UDP:
         knocks_ms, why = _probe(host, port)
@@ -51,7 +51,7 @@ def findings(endpoint: str, robot: str, secure: str) -> Iterator[Finding]:
     if not host.startswith(endpoints.LOOPBACK):
         yield _found_by_multicast(host)
     try:
-        role = viewer_role(secure) if secure else ROLE  # an operator's keys may acknowledge frames
+        role = viewer_role(secure) if secure else ROLE  # with an operator's keys it may acknowledge frames
         with open_link(robot, connect=[endpoint], role=role, secure=secure) as link:
             if transport in endpoints.OVER_UDP:
                 yield from _round_trip(_answer_ms(link), "queries")
@@ -62,7 +62,7 @@ def findings(endpoint: str, robot: str, secure: str) -> Iterator[Finding]:
 
 
 def _no_link(error: SightlineError, endpoint: str) -> Finding:
-    """Make a finding of a link that did not open. A handshake worked before, so another program may listen there."""
+    """Return the finding for a link that did not open. The handshake worked, so another program may listen there."""
     found = trouble("link", error)
     if not found.value.startswith("no answer from"):
         return found
@@ -76,7 +76,7 @@ def _no_link(error: SightlineError, endpoint: str) -> Finding:
 
 
 def _found_by_multicast(host: str) -> Finding:
-    """Report whether discovery finds the machine; it is a convenience, so it never fails."""
+    """Report if discovery finds the machine. Discovery is optional, so this never fails."""
     try:
         there = socket.gethostbyname(host) in {
             endpoints.parse_zenoh_endpoint(one)[1] for one in find_listeners(_SCOUT_S)
@@ -94,13 +94,13 @@ def _answer_ms(link: Link) -> list[float]:
 
 
 def _peers_of(link: Link) -> list[PeerInfo]:
-    """Return the peers on `link`; none on a link without queries."""
+    """Return the peers on `link`; empty on a link without queries."""
     query: Callable[[], list[PeerInfo]] = getattr(link, "peers", list)
     return query()
 
 
 def _peers(link: Link, robot: str) -> Iterator[Finding]:
-    """Yield the versions of both ends and the difference of their clocks; a WebSocket does not report them."""
+    """Yield the versions of both ends and the difference of their clocks. A WebSocket does not report them."""
     ours = software_version()
     for peer in best_round_trips([_peers_of(link) for _ in range(QUERY_ROUNDS)]):
         presence = peer.presence
@@ -125,7 +125,7 @@ def _address(endpoint: str) -> tuple[str, str, int]:
 
 
 def _probe(host: str, port: int) -> tuple[list[float], str]:
-    """Measure TCP handshakes, one round trip each, in ms; also return the reason if one fails."""
+    """Measure TCP handshakes, one round trip each, in ms. Also return the reason if one fails."""
     times_ms: list[float] = []
     for _ in range(_PROBES):
         begun_ns = time.monotonic_ns()
@@ -145,7 +145,7 @@ def _probe(host: str, port: int) -> tuple[list[float], str]:
 
 
 def neighbor(host: str, port: int, table: Path = ARP_TABLE) -> str:
-    """Return what the kernel knows of a silent machine on the same network: whether it exists at all."""
+    """Return the kernel's information on a silent machine of the same network: whether it exists."""
     try:
         rows = [line.split() for line in table.read_text().splitlines()[1:]]
         address = socket.gethostbyname(host)
@@ -193,7 +193,7 @@ def _rejections(status: Status) -> Iterator[Finding]:
 
 
 def _watch(link: Link, viewer: FrameViewer) -> tuple[float, float]:
-    """Measure frames per second and kB per frame for a few seconds; acknowledge each, as a viewer does."""
+    """Measure frames per second and kB per frame for a few seconds. It acknowledges each frame as a viewer."""
     slot, begun_s = link.latest(FRAME), time.monotonic()
     sizes: list[int] = []
     while time.monotonic() - begun_s < _LISTEN_S:

@@ -29,7 +29,7 @@ from sightline.vision_side.decode import Decoder
 
 
 def jpeg_pixels(jpeg: bytes) -> NDArray[np.uint8]:
-    """Decode a JPEG to BGR in full size. Raises WireError MALFORMED for an invalid or too large one."""
+    """Decode a JPEG to BGR in full size. Raises WireError MALFORMED for an invalid or too large JPEG."""
     size = read_jpeg_size(jpeg)
     _checker(size.width_px, size.height_px).check(jpeg)
     try:
@@ -50,15 +50,15 @@ def _checker(width_px: int, height_px: int) -> Decoder:
 Image = NDArray[np.uint8]
 _TICKS_PER_S: Final = 90_000  # usual for H.264
 _TIME_BASE: Final = Fraction(1, _TICKS_PER_S)
-# Without B-frames the last image is the last in the file. With them the file ends before it.
+# Without B-frames, because with them the file ends before the last image.
 _ENCODING: Final = {"preset": "veryfast", "crf": "23", "bf": "0"}
 
 
 class Film:
-    """`with Film(path, fps) as film: film.add(picture, t_us)`. Images of another size are fitted to the first."""
+    """`with Film(path, fps) as film: film.add(picture, t_us)`. Images of another size are scaled to the first size."""
 
     def __init__(self, path: Path, fps: int) -> None:
-        """Open the file; `fps` is a hint for the encoder. Raises ConfigError without PyAV or for a bad path."""
+        """Open the file; `fps` is a hint for the encoder. Raises ConfigError without PyAV or for an invalid path."""
         with needs("report"):
             import av
         with writes(path):
@@ -68,10 +68,10 @@ class Film:
         self._first_us = self._last_ticks = -1
         self.frames = 0
         self.size_px = (0, 0)
-        """Width and height of the film, which are even."""
+        """Width and height of the film, both even."""
 
     def add(self, picture: Image, t_us: int) -> bool:
-        """Append an image (BGR). Returns False and skips it unless it is later than the last."""
+        """Append an image (BGR). An image that is not later than the last one is skipped, and returns False."""
         if self._stream is None:
             self._first_us = t_us
             self._stream = self._opened(picture)
@@ -95,7 +95,7 @@ class Film:
         return 0.0 if self._first_us < 0 else (t_us - self._first_us) / 1e6
 
     def close(self) -> None:
-        """Write the rest of the encoder's data and the index."""
+        """Write the remaining data of the encoder and the index."""
         try:
             if self._stream is not None:
                 self._container.mux(self._stream.encode(None))
@@ -110,14 +110,14 @@ class Film:
     ) -> None:
         if error is None:
             self.close()
-        else:  # after a write that failed, FFmpeg crashes if it is to write the rest
+        else:  # after a failed write, FFmpeg would crash while it writes the rest
             self._container.close()
 
     def _opened(self, picture: Image) -> Any:
         stream = self._container.add_stream("libx264", rate=self._fps)
         height, width = picture.shape[:2]
         self.size_px = stream.width, stream.height = max(2, width - width % 2), max(2, height - height % 2)
-        stream.pix_fmt = "yuv420p"  # every player shows it; it needs even sides
+        stream.pix_fmt = "yuv420p"  # for all players; it needs even sides
         stream.time_base = stream.codec_context.time_base = _TIME_BASE
         stream.options = dict(_ENCODING)
         return stream
@@ -139,9 +139,9 @@ VIDEO: Final = ".mp4"
 PATIENCE_S: Final = 5.0
 _WAIT_S: Final = 0.5
 _FPS: Final = 30
-_SHORT_S: Final = 1.0  # as long as the status of a robot may be missing
+_SHORT_S: Final = 1.0  # longest gap in the status of a present robot
 Cut = Literal["", "interrupted", "silent"]
-"""Why a film is shorter than requested: the user ended it, or the images did."""
+"""Why a film is shorter than requested: the user ended it, or no more images came."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +157,7 @@ class Captured:
 
 
 def check_target(path: Path, seconds: float | None) -> None:
-    """Raise ConfigError for a file that is neither image nor video, or that cannot be written."""
+    """Raise ConfigError for a file that is neither an image nor a video, or that cannot be written."""
     kind = path.suffix.lower()
     if kind not in (*PICTURES, VIDEO):
         raise ConfigError(f"invalid file {path}: a snapshot ends in .png or .jpg, a video in .mp4")
@@ -169,10 +169,10 @@ def check_target(path: Path, seconds: float | None) -> None:
 
 
 def snapshot(pictures: Pictures, path: Path, wanted: Channel) -> Captured:
-    """Write the next image to `path`, as PNG or as received JPEG. Raises LinkError if none arrives."""
+    """Write the next image to `path`, as PNG or as the received JPEG. Raises LinkError without an image."""
     ends_s = time.monotonic() + PATIENCE_S
     while (shot := _wanted(pictures, wanted, ends_s)) is not None:
-        with suppress(WireError):  # the next one may be valid
+        with suppress(WireError):  # the next image may be valid
             data = shot.jpeg if path.suffix.lower() != ".png" else cv2.imencode(".png", jpeg_pixels(shot.jpeg))[1]
             write_whole(path, bytes(data))
             return Captured(path, 1, 0.0, shot.width_px, shot.height_px)
@@ -180,12 +180,12 @@ def snapshot(pictures: Pictures, path: Path, wanted: Channel) -> Captured:
 
 
 def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Captured:
-    """Write the images of `seconds`, or until Ctrl-C, SIGTERM or SIGHUP, to `path`. Raises LinkError if none arrives,
+    """Write the images of `seconds`, or until Ctrl-C, SIGTERM or SIGHUP, to `path`. Raises LinkError without an image,
     ConfigError for a path that cannot be written.
 
-    The capture times end it, so that a first image that comes late does not make the film longer.
+    The capture times determine its length, so a late first image does not make the film longer.
     """
-    target = Path(os.path.realpath(path))  # a symbolic link stays one
+    target = Path(os.path.realpath(path))  # a symbolic link is preserved
     with _terminated_like_ctrl_c(), writes(path), whole(target, VIDEO) as part:
         with Film(part, _FPS) as made:
             cut = _fill(made, pictures, wanted, seconds)
@@ -202,12 +202,12 @@ def _fill(made: Film, pictures: Pictures, wanted: Channel, seconds: float) -> Cu
         while (shot := _wanted(pictures, wanted, ends_s or time.monotonic() + PATIENCE_S)) is not None:
             now_s = time.monotonic()
             ends_s = ends_s or now_s + seconds
-            if shot.session != session:  # the robot's clock may have begun again: this machine's bridges the gap
+            if shot.session != session:  # the robot's clock may have restarted; this machine's clock covers the gap
                 elapsed_s = max(now_s + seconds - ends_s, made.seconds + 0.001)
                 session, offset_us = shot.session, round(elapsed_s * 1e6) - shot.t_us
             if made.since_first_s(shot.t_us + offset_us) > seconds:
                 break
-            with suppress(WireError):  # an invalid image
+            with suppress(WireError):  # the image is invalid
                 made.add(jpeg_pixels(shot.jpeg), shot.t_us + offset_us)
     except KeyboardInterrupt:
         if not made.frames:
@@ -218,7 +218,7 @@ def _fill(made: Film, pictures: Pictures, wanted: Channel, seconds: float) -> Cu
 
 @contextmanager
 def _terminated_like_ctrl_c() -> Iterator[None]:
-    """SIGTERM and SIGHUP become KeyboardInterrupt, and a further one is ignored: a closed terminal sends two."""
+    """Convert SIGTERM and SIGHUP to KeyboardInterrupt, and ignore further ones: a closed terminal sends two."""
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
         for number in before:
@@ -237,7 +237,7 @@ def _terminated_like_ctrl_c() -> Iterator[None]:
 
 
 def _wanted(pictures: Pictures, wanted: Channel, ends_s: float) -> Shot | None:
-    """Return the next image of that channel, or None at the end."""
+    """Return the next image of the channel, or None at `ends_s`."""
     while (left_s := ends_s - time.monotonic()) > 0:
         shot = pictures.take(min(left_s, _WAIT_S))
         if shot is not None and shot.channel is wanted:

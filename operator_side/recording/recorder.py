@@ -1,10 +1,10 @@
 """Writes the messages of a link to MCAP and reads them back. Shell (threads, files).
 
-One MCAP channel per Sightline channel (and source: `twist/vision`), as JSON with a schema, which other tools show
-(`foxglove`). A message that is not valid JSON, and every message of older recordings, has the encoding `sightline.v1`:
-header length (uint16, big-endian), header, payload. Both read back exactly as the message came. `log_time` is when this
-end received it, for the robot's own clock is in the header. It never goes back: the wall clock is read once. A file cut
-short by a kill reads here up to the cut; for other tools, `mcap recover` writes its index.
+Each Sightline channel (with its source: `twist/vision`) is one MCAP channel of JSON messages with a schema, which other
+tools show (`foxglove`). Invalid messages, and all messages of older recordings, have the encoding `sightline.v1`: header
+length (uint16, big-endian), header and payload. Both are read back exactly as received. `log_time` is the time of
+arrival; the header has the robot's time. It never goes back, because the wall clock is read once. A file that a kill
+truncated is readable here up to the cut; for other tools, `mcap recover` writes its index.
 """
 
 import errno
@@ -47,9 +47,9 @@ ENCODING: Final = "sightline.v1"
 METADATA: Final = "sightline"
 RECORDED: Final = (FRAME, TWIST, ACK, STATUS, CAMERA, SCAN, MISSION, REPORT, DETECTIONS)
 MAX_WAITING: Final = 256
-"""The most messages that wait for the disk; further ones are dropped and counted."""
+"""Limit of messages that wait for the disk; further ones are dropped and counted."""
 CLOSE_S: Final = 5.0
-"""For the disk to take what waits when the recording is closed."""
+"""Time for the disk to write the waiting messages at the end of the recording."""
 CHUNK_BYTES: Final = 256 * 1024  # a kill loses at most one chunk
 _LENGTH = struct.Struct(">H")
 
@@ -65,7 +65,7 @@ class Recorded:
 
 
 class Recorder:
-    """Records `link` from construction to `close`. Its callbacks only queue; a thread writes."""
+    """Records `link` from construction to `close`. Its callbacks only queue messages; a thread writes them."""
 
     def __init__(
         self, link: Link, path: Path, about: Mapping[str, str], channels: Iterable[Channel] = RECORDED
@@ -77,10 +77,10 @@ class Recorder:
         self._ids: dict[tuple[str, str], int] = {}
         self._counts: dict[str, int] = {}
         self.dropped = 0
-        """Number of messages that the disk was too slow for."""
+        """Number of messages dropped because the disk was too slow."""
         self.failed = ""
         """The error that ended the recording, or ""."""
-        self._since_ns = time.time_ns() - time.monotonic_ns()  # once: MCAP tools sort by time, and the wall clock steps
+        self._since_ns = time.time_ns() - time.monotonic_ns()  # read once, because the wall clock may jump
         self._closed = False
         self._ended = threading.Event()
         self._writing = threading.Thread(target=self._write_all, name="recorder", daemon=True)
@@ -113,11 +113,11 @@ class Recorder:
 
     @contextmanager
     def _reporting(self) -> Iterator[None]:
-        """Turn a failed write into one log line and the end of the recording."""
+        """Convert a failed write to one log line, and end the recording."""
         try:
             yield
-        except Exception as error:  # the library's own too: whatever it is, `close` must not wait for it
-            cause = getattr(error, "strerror", None)  # of the disk; any other is a defect
+        except Exception as error:  # also errors of the library, because `close` must not wait for this thread
+            cause = getattr(error, "strerror", None)  # only for errors of the disk; others are defects
             self._fail(cause or f"{type(error).__name__}: {report_fault('recorder', error)}")
 
     def _fail(self, why: str) -> None:
@@ -150,12 +150,12 @@ class Recorder:
         return self._ids[topic, encoding]
 
     def close(self) -> None:
-        """Write the waiting messages and finish the file, for `CLOSE_S` at most; a second call does nothing."""
+        """Write the waiting messages and finish the file, for `CLOSE_S` at most. Idempotent."""
         if self._closed:
             return
         self._closed = True
         self._ended.set()
-        with suppress(queue.Full):  # then the thread has something to wake for
+        with suppress(queue.Full):  # a full queue wakes the thread as well
             self._queue.put_nowait(None)
         self._writing.join(CLOSE_S)
         if self._writing.is_alive():
@@ -171,14 +171,14 @@ class Recorder:
 
 
 class RecordingFile:
-    """A file without a buffer: where the disk hangs, Python waits at its exit for the lock of a buffered file."""
+    """An unbuffered file. If the disk hangs, Python would wait at exit for the lock of a buffered file."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("wb", buffering=0)
         self.tell, self.flush, self.close = self._file.tell, self._file.flush, self._file.close
 
     def write(self, data: bytes) -> None:
-        """Write all of `data`. Raises OSError where the disk takes only a part."""
+        """Write all of `data`. Raises OSError if the disk accepts only a part."""
         if self._file.write(data) < len(data):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -193,12 +193,12 @@ def _open_new(path: Path) -> RecordingFile:
 def _writer(file: RecordingFile) -> "Writer":
     with needs("report"):
         from mcap.writer import CompressionType, Writer
-    # JPEG does not compress; the rest is not worth the time on the machine that drives.
+    # JPEG data does not compress further, and the other data is not worth the CPU time of the driving machine.
     return Writer(cast(Any, file), chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
 
 
 def read_recording(path: Path) -> Iterator[Recorded]:
-    """Yield every message in the order of arrival, to the end of the file. Raises ConfigError for another file."""
+    """Yield every message in the order of arrival, to the end of the file. Raises ConfigError for another file type."""
     with _reading(path) as reader:
         for _schema, channel, message in reader.iter_messages(log_time_order=False):
             parsed = _parse(channel.topic, channel.message_encoding, message.data)
@@ -224,11 +224,11 @@ def _reading(path: Path) -> Iterator[Any]:
     try:
         with path.open("rb") as file:
             yield NonSeekingReader(file)
-    except (EndOfFile, struct.error, UnicodeDecodeError):  # the cut is inside a number or a letter
+    except (EndOfFile, struct.error, UnicodeDecodeError):  # the cut is inside a number or a character
         return
     except OSError as error:
         raise ConfigError(f"cannot read recording {path}: {error.strerror}") from None
-    except (McapError, ValueError, OverflowError, MemoryError) as error:  # a damaged length may be of any size
+    except (McapError, ValueError, OverflowError, MemoryError) as error:  # a damaged length may have any value
         raise ConfigError(f"invalid recording {path}: {type(error).__name__}") from None
 
 

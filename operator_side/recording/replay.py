@@ -1,7 +1,7 @@
-"""Replays a recording through a fresh pipeline; the twists must be the same, byte for byte. Shell (reads files).
+"""Replays a recording through a new pipeline. The twists must be equal, byte for byte. Shell (reads files).
 
-It feeds the answered frames again in the order of their answers, with one pipeline per session of the vision service,
-and with the scan and the mission that each answer cites.
+It processes the answered frames in the order of their answers, with one pipeline per session of the vision service, and
+with the scan and the mission that each answer cites.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -35,14 +35,14 @@ from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline, PipelineAnsw
 from sightline.vision_side.tracking.locate import BoxReader
 
 VISION_CONFIG = "vision_config"
-"""Key of the recording's metadata that has the configuration of the vision service, as JSON."""
+"""Metadata key of the vision configuration, as JSON."""
 
 _FrameId = tuple[str, int]
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One answered frame: the recorded answer (None: an acknowledgment) and the answer of the pipeline now."""
+    """One answered frame: the recorded answer (None: an acknowledgment) and the new answer of the pipeline."""
 
     frame: Frame
     sent: bytes | None
@@ -50,7 +50,7 @@ class Step:
 
     @property
     def now(self) -> bytes | None:
-        """Return the payload of the pipeline's answer."""
+        """Return the payload of the pipeline's new answer."""
         return format_twist(self.answer.twist) if self.answer.twist is not None else None
 
 
@@ -62,18 +62,18 @@ class Replayed:
     equal: int = 0
     missing_frames: int = 0
     gaps: int = 0
-    """Number of answers, and of scans and missions that they cite, that are not in the recording."""
+    """Number of answers, and of cited scans and missions, that are not in the recording."""
     first_difference: str = ""
 
     @property
     def ok(self) -> bool:
-        """Return whether every answer is recorded and equal."""
+        """Return True if every answer is recorded and equal."""
         return 0 < self.total == self.equal and not self.missing_frames and not self.gaps
 
 
 @dataclass(slots=True)
 class _Answers:
-    """The recorded answers by the frame that they cite, with the scans and missions that they cite."""
+    """The recorded answers by the cited frame, with the cited scans and missions."""
 
     by_frame: dict[_FrameId, list[tuple[AnswerHeader, bytes | None]]] = field(default_factory=dict)
     gaps: int = 0
@@ -84,7 +84,8 @@ class _Answers:
 
 
 def replay(path: Path, on_step: Callable[[Step], None] = lambda _step: None) -> Replayed:
-    """Replay the recording at `path`; calls `on_step` for each answered frame. Raises ConfigError for another file."""
+    """Replay the recording at `path` and call `on_step` for each answered frame. Raises ConfigError for another file.
+    """
     answers = _answers(path)
     missing = _gather_cited(path, answers)
     result = Replayed(gaps=answers.gaps + missing)
@@ -113,7 +114,7 @@ def recorded_frames(path: Path) -> Iterator[Frame]:
 
 
 def _messages(path: Path) -> Iterator[Message]:
-    """Yield the valid messages; the services ignored the others, too."""
+    """Yield the valid messages. The services ignored the others, too."""
     for recorded in read_recording(path):
         with suppress(WireError):
             _check(recorded.message)
@@ -130,7 +131,7 @@ def _check(message: Message) -> None:
 
 
 def _newest_camera(message: Message, camera: CameraModel, pipelines: Iterable[Pipeline]) -> CameraModel:
-    """Return the camera model in `message`; the pipelines continue with a new one."""
+    """Return the camera model in `message`. The pipelines continue with a new model."""
     model = decode(CameraModel, message.payload, CAMERA.max_payload_bytes)
     for pipeline in pipelines if model != camera else ():
         pipeline.set_camera(model)
@@ -138,7 +139,7 @@ def _newest_camera(message: Message, camera: CameraModel, pipelines: Iterable[Pi
 
 
 def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
-    """Remove each used answer from `answers`; the rest cite frames that are not in the recording."""
+    """Yield the steps, and remove each used answer from `answers`. The rest cite frames outside the recording."""
     config = _vision_config(path)
     camera, detector = _first_camera(path), configured_detector(config)
     pipelines: dict[str, Pipeline] = {}
@@ -173,7 +174,7 @@ def _by_boxes(
 
 
 def _give(pipeline: Pipeline, header: AnswerHeader, answers: _Answers, config: VisionConfig) -> None:
-    """Return the scan and mission that the answer of `header` cites, if they are in the recording."""
+    """Pass the scan and mission that the answer cites to the pipeline, if they are in the recording."""
     scan = answers.scans.get((header.echo.session, header.scan)) if header.scan is not None else None
     if scan is not None:
         pipeline.put_scan(*decode_scan(scan.header, scan.payload))
@@ -183,7 +184,7 @@ def _give(pipeline: Pipeline, header: AnswerHeader, answers: _Answers, config: V
 
 
 def _gather_cited(path: Path, answers: _Answers) -> int:
-    """Add the scans and missions that answers cite. Returns how many are not in the recording."""
+    """Add the cited scans and missions. Returns the number of those that are not in the recording."""
     headers = [header for some in answers.by_frame.values() for header, _ in some]
     scans = {(one.echo.session, one.scan) for one in headers if one.scan is not None}
     missions = {one.mission for one in headers if one.mission is not None}

@@ -1,6 +1,6 @@
 """Writes systemd units for a robot, a vision service or several of them. Shell (files).
 
-The units are readable files (`robot_side/systemd`, `vision_side/systemd`); only paths, user and pins change.
+The templates are readable files (`robot_side/systemd`, `vision_side/systemd`). Only paths, user and pins are replaced.
 """
 
 import grp
@@ -24,10 +24,10 @@ _PROGRAM = "/opt/sightline/bin/sightline"
 _PYTHON = "/opt/sightline/bin/python"
 _DROP_IN = "gpio-low.conf"
 MAX_INSTANCES = 64
-"""Vision services of one machine. More than one per core gains nothing."""
+"""Limit of vision services on one machine. More than one per core has no benefit."""
 _STARTED_AT_BOOT = "multi-user.target.wants"
 _DROP_INS_PINS = "gpio_low 10 9 8 7 17"
-"""The pins in the file of `robot_side/systemd`: those of the example car."""
+"""Pins in the file of `robot_side/systemd`: those of the example car."""
 _GROUPS = "SupplementaryGroups=video gpio"
 _STATE_DIR = "Environment=SIGHTLINE_ROBOT__STATE_DIR=/var/lib/sightline"
 _NAME = " --name %l-%i"
@@ -35,7 +35,7 @@ _NAME = " --name %l-%i"
 
 @dataclass(frozen=True)
 class InstallPlan:
-    """One systemd file: its path and text, and the units to start, which are several for a template."""
+    """One systemd file: its path and text, and the units to start (several for a template)."""
 
     service: str
     path: Path
@@ -46,10 +46,10 @@ class InstallPlan:
 def plan(
     service: str, program: Path, config: Path, user: str, unit_dir: Path = UNIT_DIR, *, instances: int | None = None
 ) -> InstallPlan:
-    """Make the unit of `service` for this machine: its paths, groups and name.
+    """Create the unit of `service` for this machine, with its paths, groups and name.
 
     Args:
-        instances: number of vision services that share the robots; None for one that shares with no other.
+        instances: number of vision services that share the robots; None for a service that does not share.
 
     Raises:
         ConfigError: the service has no unit, or systemd cannot read the path or user.
@@ -68,12 +68,12 @@ def plan(
     unit = files(f"sightline.{service}_side").joinpath("systemd", name).read_text()
     unit = unit.replace("User=sightline", f"User={user}").replace(_GROUPS, _present(_GROUPS))
     if not re.fullmatch(NAME_PATTERN, f"{os.uname().nodename.partition('.')[0]}-{MAX_INSTANCES}"):
-        unit = unit.replace(_NAME, "")  # the service makes one
+        unit = unit.replace(_NAME, "")  # the service chooses its own name
     return InstallPlan(service, unit_dir / name, _fitted(unit, service, program, config), units)
 
 
 def check_user(user: str) -> None:
-    """Raise ConfigError for an account that this machine does not have: systemd starts no service for it."""
+    """Raise ConfigError for an unknown account, because systemd would not start the service."""
     try:
         pwd.getpwuid(int(user)) if user.isdigit() else pwd.getpwnam(user)
     except (KeyError, ValueError, OverflowError):
@@ -81,7 +81,7 @@ def check_user(user: str) -> None:
 
 
 def with_state_in(planned: InstallPlan, folder: Path) -> InstallPlan:
-    """Let the service store the STOP latch in the folder of its configuration, not in that of the unit.
+    """Let the service store the STOP latch in the folder of its configuration, instead of the unit's folder.
 
     Raises:
         ConfigError: systemd cannot read the path, or it depends on the user.
@@ -93,7 +93,7 @@ def with_state_in(planned: InstallPlan, folder: Path) -> InstallPlan:
 
 
 def drop_in(robot: RobotConfig, program: Path, config: Path, unit_dir: Path = UNIT_DIR) -> InstallPlan | None:
-    """Make the file that sets the pins of a `gpio` drive low; None for another drive.
+    """Create the file that sets the pins of a `gpio` drive low; None for another drive.
 
     Raises:
         ConfigError: the options of the drive are invalid.
@@ -117,14 +117,14 @@ def drop_in_path(unit_dir: Path = UNIT_DIR) -> Path:
 
 
 def _present(groups: str) -> str:
-    """Leave out the groups that this machine lacks: systemd starts no service with an unknown group."""
+    """Remove the groups that this machine lacks, because systemd starts no service with an unknown group."""
     there = {one.gr_name for one in grp.getgrall()}
     key, _, names = groups.partition("=")
     return f"{key}={' '.join(name for name in names.split() if name in there)}"
 
 
 def _fitted(unit: str, service: str, program: Path, config: Path) -> str:
-    """Insert this machine's paths and remove the comments, which describe the packaged file."""
+    """Insert this machine's paths, and remove the comments, which describe the template."""
     fitted = (
         unit.replace(_PROGRAM, str(program)).replace(_PYTHON, str(program.with_name("python")))
         .replace(f"/etc/sightline/{service}.toml", str(config))
@@ -136,8 +136,8 @@ def _fitted(unit: str, service: str, program: Path, config: Path) -> str:
 def write(planned: InstallPlan, beside: InstallPlan | None = None) -> list[str]:
     """Write the unit and its second file, and start it now and at boot. Returns the units that it ended.
 
-    A running service restarts: otherwise it may drive other pins than those that its end sets low. Several restart one
-    after another, so that the others have the robots meanwhile. Units of an earlier number of instances end.
+    A running service restarts, because otherwise its end could set other pins low than those it drives. Several
+    services restart one after another, so that the others drive the robots meanwhile. Surplus instances end.
 
     Raises:
         ConfigError: a file cannot be written, or systemd does not run; nothing is started.
@@ -163,7 +163,7 @@ def _other_units(planned: InstallPlan) -> list[str]:
 
 
 def _put(planned: InstallPlan) -> None:
-    part = planned.path.with_name(f".{planned.path.name}.part")  # a disk that is full must not leave half a unit
+    part = planned.path.with_name(f".{planned.path.name}.part")  # a full disk must not leave half a unit
     try:
         if planned.path.name == _DROP_IN:
             planned.path.parent.mkdir(exist_ok=True)
@@ -176,7 +176,7 @@ def _put(planned: InstallPlan) -> None:
 
 
 def take_away(path: Path) -> bool:
-    """Remove the second file of an earlier drive. Returns whether it existed. Raises ConfigError."""
+    """Remove the second file of an earlier drive. Returns True if it existed. Raises ConfigError."""
     try:
         path.unlink()
     except FileNotFoundError:

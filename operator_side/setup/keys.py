@@ -1,8 +1,8 @@
 """A private authority with a certificate and a token for each role. Shell (files).
 
 It uses `cryptography`, as Python's own packaging does. Elliptic-curve keys (P-256) keep the TLS handshake short on a
-small robot. Only `ca.pem` and the files of its own role belong on a machine, and all tokens on a
-robot that serves WebSocket; `stop.secret` on robots, routers and operators; `ca.key` belongs on none.
+small robot. A machine should have only `ca.pem` and the files of its own role. A robot with WebSocket also needs all
+tokens; robots, routers and operators need `stop.secret`. No machine needs `ca.key`.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 
 DAYS = 825
-"""The longest validity of a role's certificate that common TLS stacks accept."""
+"""Longest validity of a role's certificate that common TLS stacks accept."""
 AUTHORITY_DAYS = 3650
-"""Long, so that the certificates can be renewed several times: each machine trusts this authority only."""
+"""Long enough to renew the certificates several times, because each machine trusts only this authority."""
 STOP = "stop"
-"""Name of the STOP secret beside the roles."""
+"""Name of the STOP secret, next to the roles."""
 _TOKEN_BYTES = 24  # 192 bits, 32 letters
 LOOPBACK = ("localhost", "127.0.0.1")
 _BEGUN_EARLIER = datetime.timedelta(days=1)  # for machines whose clocks differ by hours
@@ -37,7 +37,7 @@ _BEGUN_EARLIER = datetime.timedelta(days=1)  # for machines whose clocks differ 
 
 @dataclass(frozen=True)
 class Certificate:
-    """The role, hosts and validity of one certificate file. It ends with its authority at the latest."""
+    """The role, hosts and validity of one certificate file. It expires with its authority at the latest."""
 
     file: Path
     role: str
@@ -46,7 +46,7 @@ class Certificate:
     ends: datetime.datetime
     ends_with_authority: bool
     is_foreign: bool = False
-    """The authority in the folder has not signed it."""
+    """True if the authority in the folder has not signed it."""
 
     def problem(self, now: datetime.datetime) -> str:
         """Return the reason why no peer accepts it now, or ""."""
@@ -61,16 +61,16 @@ def make(folder: Path, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
     """Create an authority, and a certificate for each role, valid for `hosts` and loopback. Returns the files.
 
     Args:
-        days: validity of the certificates; the authority has `AUTHORITY_DAYS`.
+        days: validity of the certificates; that of the authority is `AUTHORITY_DAYS`.
 
     Raises:
-        ConfigError: the folder already has keys or cannot be written; nothing is changed.
+        ConfigError: the folder already has keys or cannot be written. No file is changed.
     """
     from cryptography import x509
     from cryptography.hazmat.primitives.asymmetric import ec
 
     for host in hosts:
-        _general_name(host)  # rejects an invalid host before anything is written
+        _general_name(host)  # raises for an invalid host before any file is written
     key = ec.generate_private_key(ec.SECP256R1())
     builder = _builder("sightline authority", "sightline authority", key, _days_from_now(AUTHORITY_DAYS))
     builder = builder.add_extension(x509.BasicConstraints(True, 0), True)
@@ -89,12 +89,12 @@ def make(folder: Path, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
 def add(folder: Path, role: str, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
     """Create a new certificate of `role`, signed by the authority in `folder`.
 
-    `STOP` is not a role: it creates the STOP secret. Without `hosts` a certificate keeps those of the present one. It
-    ends with its authority at the latest.
+    `STOP` is not a role: it creates the STOP secret. Without `hosts` a new certificate keeps the present hosts. It
+    expires with its authority at the latest.
 
     Raises:
         ConfigError: the role or a host is invalid, the authority has expired or its files are missing or do not belong
-            together, or the folder cannot be written; nothing is changed.
+            together, or the folder cannot be written. No file is changed.
     """
     if role == STOP:
         return _write_secret(folder)
@@ -128,7 +128,7 @@ def _issued(
 
 
 def look(folder: Path) -> list[Certificate]:
-    """Read the certificates in `folder`. Raises ConfigError without one or for an invalid one."""
+    """Read the certificates in `folder`. Raises ConfigError without a certificate or for an invalid one."""
     found = {file: _load(file) for file in sorted(folder.glob("*.pem"))}
     if not found:
         raise ConfigError(f"no certificates in {folder}; create them with: sightline keys init {folder}")
@@ -136,7 +136,7 @@ def look(folder: Path) -> list[Certificate]:
 
 
 def _days_from_now(days: float) -> datetime.datetime:
-    # A certificate has whole seconds.
+    # The times of a certificate have whole seconds.
     return (datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)).replace(microsecond=0)
 
 
@@ -171,7 +171,7 @@ def _general_name(host: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
         parts = host.split(".")
-        # A name whose last part is a number is an address with a mistake.
+        # A name whose last part is a number is a mistyped address.
         if not host.isascii() or not all(part.replace("-", "a").isalnum() for part in parts) or parts[-1].isdigit():
             raise ConfigError(
                 f"invalid host '{host}'; expected a name or address, e.g. robot.local or 192.168.1.20"
@@ -205,7 +205,7 @@ def _random() -> bytes:
 
 
 def _write(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
-    """Write the files, of which all but certificates are private. On a full disk the earlier ones stay as they are."""
+    """Write the files, all private except the certificates. A full disk leaves the earlier files unchanged."""
     parts = {folder / name: folder / f".{name}.part" for name in files}
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -252,7 +252,7 @@ def _load(file: Path) -> x509.Certificate:
     try:
         return x509.load_pem_x509_certificate(file.read_bytes())
     except (OSError, ValueError):
-        # The present addresses are not known, and new keys of all roles are not needed for one of them.
+        # The present addresses are unknown, and one damaged certificate does not need new keys for all roles.
         repair = (f"replace it with: sightline keys add {file.parent} {file.stem} --host HOST"
                   if file.stem in CERTIFICATES else f"create new ones with: sightline keys init {file.parent}-new")
         raise ConfigError(f"invalid certificate {file}; {repair}") from None

@@ -1,4 +1,4 @@
-"""Runs a Zenoh router to which robots, vision services and operators of one site connect. Shell.
+"""Runs a Zenoh router for the robots, vision services and operators of one site. Shell.
 
 A stock `zenohd` also works, without the access rules of `--secure` and without the STOP port.
 """
@@ -64,7 +64,7 @@ def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
 
 
 def _raise_descriptor_limit() -> None:
-    """Permit this process as many descriptors as its sessions need, as far as the system does."""
+    """Raise the limit of descriptors to the number that the sessions need, as far as the system permits."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = _DESCRIPTORS if hard == resource.RLIM_INFINITY else min(_DESCRIPTORS, hard)
     if resource.RLIM_INFINITY != soft < wanted:
@@ -72,7 +72,7 @@ def _raise_descriptor_limit() -> None:
 
 
 def _stop_forwarder(addresses: Sequence[tuple[str, int]], secure: str) -> StopProcess | None:
-    """Prepare the forwarder of STOP datagrams; None where keys are used without a STOP secret."""
+    """Prepare the forwarder of STOP datagrams; None with keys but without a STOP secret."""
     try:
         return stop_forwarder.start(addresses, stop_secret_file(secure) if secure else "")
     except ConfigError as error:
@@ -81,7 +81,7 @@ def _stop_forwarder(addresses: Sequence[tuple[str, int]], secure: str) -> StopPr
 
 
 def _watch(forwarder: StopProcess) -> None:
-    """Start the forwarder again where it ended, and log what it reports."""
+    """Restart the forwarder after its end, and log its reports."""
     forwarder.keep_alive(monotonic_us())
     for packet in read_packets(forwarder.near):
         if packet.startswith(b"L"):

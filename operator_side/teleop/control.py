@@ -1,4 +1,4 @@
-"""The logic of teleop: held keys, speeds, hand-over to vision, and the messages for the robot. Pure."""
+"""The logic of teleop: held keys, speeds, handover to the vision service, and the messages to the robot. Pure."""
 
 import secrets
 from collections.abc import Iterator, Mapping
@@ -29,19 +29,19 @@ from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import Message
 
 _STEP: Final = 1.1
-"""A key press changes a speed by 10 %."""
+"""Factor of a speed change: a key press changes a speed by 10 %."""
 _LEAST_MPS: Final = 0.02
 _LEAST_RAD_S: Final = 0.1
 _RAMP_MPS2: Final = 0.8
 _RAMP_RAD_S2: Final = 5.0
 _FIRST_STEP_US: Final = 30_000
-"""The ramp takes its first step over this time, so that a press moves the robot with the first command."""
+"""Duration of the first ramp step, so that a press moves the robot with the first command."""
 _LONGEST_STEP_US: Final = 100_000
 
 
 @dataclass(slots=True)
 class Speeds:
-    """The operator's top speeds, within the limits of the robot."""
+    """The operator's maximum speeds, within the limits of the robot."""
 
     linear_mps: float
     angular_rad_s: float
@@ -49,13 +49,13 @@ class Speeds:
     most_rad_s: float = 10.0
 
     def change(self, linear: int, angular: int) -> None:
-        """Raise (1), lower (-1) or keep (0) each speed by 10 %."""
+        """Raise (1), lower (-1) or leave (0) each speed by 10 %."""
         self.linear_mps *= _STEP**linear
         self.angular_rad_s *= _STEP**angular
         self._keep()
 
     def limit(self, status: Status) -> None:
-        """Apply the limits of the robot's status; a zero leaves the old limit."""
+        """Apply the limits of the robot's status. A zero leaves the old limit."""
         self.most_mps = status.max_linear_mps or self.most_mps
         self.most_rad_s = status.max_angular_rad_s or self.most_rad_s
         self._keep()
@@ -84,7 +84,7 @@ class SpeedUp:
 
 
 def _towards(speed: float, goal: float, change: float) -> float:
-    """Return `goal` if slower in the same direction, else a step of `change` toward it; a reversal starts at zero."""
+    """Return `goal` if slower in the same direction, else a step of `change` toward it. A reversal starts at 0."""
     start = speed if speed * goal > 0 else 0.0
     if abs(goal) <= abs(start):
         return goal
@@ -93,8 +93,8 @@ def _towards(speed: float, goal: float, change: float) -> float:
 
 # --- keys --------------------------------------------------------------------------------------------------------
 #
-# A terminal reports presses and repeats, never releases. So a key counts as held for a little longer than the time
-# between its repeats, which is learned from the repeats; before the first repeat, a little longer than the delay.
+# A terminal reports presses and repeats, but no releases. So a key counts as held for a little longer than the interval
+# of its repeats, which is learned. Before the first repeat, it counts as held for a little longer than the delay.
 
 _ARROWS: Final = {"\x1b[A": (1, 0), "\x1b[B": (-1, 0), "\x1b[D": (0, 1), "\x1b[C": (0, -1)}
 _BOTH_SPEEDS: Final = {"+": (1, 1), "=": (1, 1), "-": (-1, -1)}
@@ -106,11 +106,11 @@ STOP_KEYS: Final = ("\n", "\r")
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The keys of one layout. Tab, Q, Space, Enter, the arrows, + and - are in all of them.
+    """The keys of one layout. Tab, Q, Space, Enter, the arrows, + and - are in all layouts.
 
     `moves` maps a key to its share of (linear, angular) speed. Back and left turns clockwise, as a car does.
     `speeds` maps a key to a change of (linear, angular) speed, up (1) or down (-1).
-    `help` is what the terminal shows.
+    `help` is the help line in the terminal.
     """
 
     moves: Mapping[str, tuple[int, int]]
@@ -156,33 +156,34 @@ LAYOUTS: Final = {"wasd": WASD, "legacy": LEGACY}
 
 
 def layout_of(name: str) -> Layout:
-    """Return the layout of `--keys`. Raises ConfigError for an unknown one."""
+    """Return the layout of `--keys`. Raises ConfigError for an unknown layout."""
     if name not in LAYOUTS:
         raise ConfigError(f"unknown --keys '{name}'; expected {' or '.join(LAYOUTS)}")
     return LAYOUTS[name]
 
 
 MOST_AT_ONCE: Final = 4
-"""The most keys of one read that a hand produces: at 30 repeats a second, those of 130 ms."""
+"""Largest number of keys in one read from a real key press: at 30 repeats a second, those of 130 ms."""
 
 _FIRST_DELAY_US: Final = 500_000
-"""From a press to its first repeat on most desktops, until it is learned."""
+"""Delay from a press to its first repeat on most desktops, until it is learned."""
 _SLACK: Final = 1.3
 _LONGEST_FIRST_US: Final = 900_000
 _FIRST_INTERVAL_US: Final = 35_000
 _INTERVALS: Final = 3
 _SHORTEST_HOLD_US: Final = 80_000
 LONGEST_HOLD_US: Final = 120_000
-"""Together with the period of the commands, a release is a zero command within 150 ms."""
+"""Longest hold after a repeat. With the command period, a release is a zero command within 150 ms."""
 _REPEATS_WITHIN_US: Final = 150_000
-"""A later key is another press."""
+"""Interval after which the same key is a new press."""
 _FORGOTTEN_US: Final = 1_000_000
 FRESH_US: Final = 300_000
-"""A press after this time without any is a new decision to drive; only such a press arms a robot."""
+"""Pause after which a press is a new decision to drive. Only such a press arms a robot."""
 
 
 def split_keys(text: str) -> list[str]:
-    """Split text from a terminal into keys: an arrow has three characters. Incomplete or unknown ones stay single."""
+    """Split text from a terminal into keys. An arrow has three characters. Unknown sequences are split into characters.
+    """
     keys: list[str] = []
     at = 0
     while at < len(text):
@@ -194,7 +195,7 @@ def split_keys(text: str) -> list[str]:
 
 @dataclass(slots=True)
 class Hold:
-    """The movement key that is held, derived from its repeats."""
+    """The held movement key, derived from its repeats."""
 
     key: str = ""
     delay_us: int = _FIRST_DELAY_US
@@ -204,10 +205,10 @@ class Hold:
     _last_us: int | None = None
 
     def press(self, key: str, now_us: int) -> bool:
-        """Take a movement key, pressed or repeated. Returns True for a fresh press, after a while without any."""
+        """Process a pressed or repeated movement key. Returns True for a fresh press, after a pause."""
         gap_us = _FORGOTTEN_US if self._last_us is None else now_us - self._last_us
         if gap_us == 0 and key == self.key:
-            return False  # several repeats of one read
+            return False  # several repeats in one read
         self._last_us = now_us
         if self._is_repeat(key, gap_us):
             self._learn(gap_us)
@@ -217,11 +218,11 @@ class Hold:
         return gap_us >= FRESH_US
 
     def _is_repeat(self, key: str, gap_us: int) -> bool:
-        """Return whether the key is a repeat: the first follows the terminal's delay, the others short intervals."""
+        """Return True for a repeat: the first comes after the terminal's delay, the others after short intervals."""
         return key == self.key and gap_us < (_FORGOTTEN_US if self._presses == 1 else _REPEATS_WITHIN_US)
 
     def _learn(self, gap_us: int) -> None:
-        """Learn the delay once a quick repeat follows it; single taps teach nothing."""
+        """Learn the delay when a quick repeat follows it. Single presses are not used."""
         if self._presses == 1:
             self._first_gap_us = gap_us
             return
@@ -234,17 +235,17 @@ class Hold:
         self.key, self._presses = "", 0
 
     def miss(self, now_us: int) -> None:
-        """Take keys that are late: no key is held, and the next press is not fresh."""
+        """Process late keys: no key is held, and the next press is not fresh."""
         self.release()
         self._last_us = now_us
 
     def is_held(self, now_us: int) -> bool:
-        """Return whether the key counts as held."""
+        """Return True if the key counts as held."""
         return bool(self.key) and self._last_us is not None and now_us - self._last_us <= self.patience_us
 
     @property
     def patience_us(self) -> int:
-        """Return how long after the last press or repeat the key counts as held."""
+        """Return the time after the last press or repeat for which the key counts as held."""
         if self._presses <= 1:
             return min(_LONGEST_FIRST_US, round(self.delay_us * _SLACK))
         return max(_SHORTEST_HOLD_US, min(LONGEST_HOLD_US, _INTERVALS * self.interval_us))
@@ -253,25 +254,25 @@ class Hold:
 # --- driving -----------------------------------------------------------------------------------------------------
 #
 # Every command cites the newest received frame, so that the robot measures the age of the link as for any driver. An
-# operator that releases the keys sends zeros and holds the lease. An operator that is gone loses it: the robot stops.
+# operator without pressed keys sends zeros and holds the lease. An operator that is gone loses it, and the robot stops.
 
 
 SOURCE: Final = "teleop"
 PERIOD_US: Final = 30_000
-"""Between commands, about one per frame. A change is sent immediately."""
+"""Time between commands, about one per frame. A change is sent immediately."""
 _REPEAT_AFTER_US: Final = 60_000
 _ARM_FOR_US: Final = 2_000_000
-"""A press requests arming for this time; five valid commands and a request take a fraction of it."""
+"""Time for which a press requests arming. Five valid commands and a request need a fraction of it."""
 _RETRIED: Final = (RejectReason.NOT_ALLOWED, RejectReason.STALE, RejectReason.OTHER_SESSION, RejectReason.UNKNOWN_FRAME,
                    RejectReason.NOT_PROVEN)
-"""Rejections that end by themselves: missing valid commands, a status from before the link or robot returned, or a
+"""Rejections that end by themselves: missing valid commands, a status from before the return of link or robot, or a
 command that overtook the request."""
 _HAND_OVER_FOR_US: Final = 5_000_000
-"""After this time there is no vision service to take over."""
+"""Time after which no vision service takes over."""
 
 
 class Mode(Enum):
-    """The driver that the operator wants."""
+    """The driver that the operator has selected."""
 
     WATCHING = "watching"
     DRIVING = "you drive"
@@ -279,7 +280,7 @@ class Mode(Enum):
 
 
 class Teleop:
-    """The session of one operator at one robot."""
+    """The session of one operator with one robot."""
 
     def __init__(self, session: str, speeds: Speeds, layout: Layout = WASD) -> None:
         self.session = session
@@ -290,17 +291,17 @@ class Teleop:
         self.mode = Mode.WATCHING
         self.report: StatusReport | None = None
         self.received_us = 0
-        """Time of the last status, valid or not."""
+        """Time of the last status, valid or invalid."""
         self.note = ""
-        """A note for the operator next to the robot's status."""
+        """A note for the operator, shown next to the robot's status."""
         self.wants_to_quit = False
         self.is_stopping = False
-        """STOP was pressed, and nothing has proven it yet."""
+        """True after STOP was pressed, until it is proven."""
         self._hold = Hold()
         self._ignored_until_us = 0
         self._stick: tuple[float, float] | None = None
         self._stick_waits = False
-        """A stop or a hand-over came with the dead man's button held: it must be released first."""
+        """True if a stop or a handover came while the dead man's button was held. It must be released first."""
         self._speed_up = SpeedUp()
         self._echo: Echo | None = None
         self._unanswered = False
@@ -311,13 +312,13 @@ class Teleop:
         self._pending_request: Verb | None = None
         self._request_due_us = self._request_until_us = self._requested_from_id = 0
 
-    # --- what comes in -------------------------------------------------------------------------------------------
+    # --- inputs --------------------------------------------------------------------------------------------------
 
     def on_keys(self, text: str, now_us: int) -> None:
-        """Take the keys of one read from the terminal.
+        """Process the keys of one read from the terminal.
 
-        Many keys at once come from a stalled link or a paste, and show no key that is held now. Of them, and of what
-        follows shortly after, only stopping counts.
+        Many keys at once come from a stalled link or a paste, and do not show the currently held key. Of these keys,
+        and of keys shortly after, only stop keys count.
         """
         keys = split_keys(text)
         if len(keys) > MOST_AT_ONCE:
@@ -340,7 +341,7 @@ class Teleop:
                 self.speeds.change(*self.layout.speeds[key])
 
     def on_stick(self, shares: tuple[float, float] | None, now_us: int) -> None:
-        """Take a gamepad's shares (-1..1) of both speeds while its dead man's button is held, else None."""
+        """Process a gamepad's shares (-1..1) of both speeds; None if its dead man's button is not held."""
         self._stick_waits &= shares is not None
         if self._stick_waits:
             return
@@ -354,11 +355,11 @@ class Teleop:
 
     @property
     def has_frame(self) -> bool:
-        """Return whether a frame has arrived; without one, a command has nothing to cite."""
+        """Return True if a frame has arrived, which a command must cite."""
         return self._echo is not None
 
     def on_frame(self, message: Message) -> None:
-        """Take the newest frame, which commands cite."""
+        """Store the newest frame, which commands cite."""
         try:
             frame = decode(FrameHeader, message.header)
         except WireError:
@@ -367,7 +368,7 @@ class Teleop:
         self._unanswered = True
 
     def on_status(self, message: Message, now_us: int) -> None:
-        """Take the newest status."""
+        """Process the newest status."""
         self.received_us = now_us
         try:
             self.report = read_report(message)
@@ -381,7 +382,7 @@ class Teleop:
             self.mode, self._pending_request, self.note = Mode.WATCHING, None, ""
 
     def on_reply(self, message: Message) -> None:
-        """Take the reply to a request."""
+        """Process the reply to a request."""
         try:
             reply = decode(Reply, message.payload, REPLY.max_payload_bytes)
         except WireError:
@@ -398,26 +399,26 @@ class Teleop:
             self.note = f"{self._pending_request} rejected: {reply.detail}"
             self._pending_request = None
 
-    # --- what the operator wants ---------------------------------------------------------------------------------
+    # --- actions of the operator ---------------------------------------------------------------------------------
 
     def stop(self) -> None:
-        """Take over and stand still; the robot stays armed, and this operator is the driver."""
+        """Take over and stand still. The robot stays armed, and this operator is the driver."""
         self._let_go()
         self.mode, self._pending_request, self._due_us = Mode.DRIVING, None, 0
 
     def latch_stop(self, now_us: int) -> None:
-        """Send STOP until it is proven. The shell sends it by datagrams meanwhile, too."""
+        """Send STOP until it is proven. The shell also sends it by datagrams."""
         self._let_go()
         self.mode, self.note, self.is_stopping = Mode.WATCHING, "STOP is not confirmed, repeating", True
         self._pending_request, self._request_due_us = None, now_us
 
     def on_stopped(self) -> None:
-        """End the repetition of STOP: the robot is STOPPED, and its wheels are at zero."""
+        """End the repetition of STOP, because the robot is STOPPED with its wheels at zero."""
         if self.is_stopping:
             self.is_stopping, self.note = False, ""
 
     def switch(self, now_us: int) -> None:
-        """Hand over to vision, or take over from it and stand still."""
+        """Hand over to the vision service, or take over from it and stand still."""
         is_manual = self.mode is Mode.DRIVING or (self.mode is Mode.WATCHING and not self._other_drives())
         if is_manual:
             self.hand_over(now_us)
@@ -425,7 +426,7 @@ class Teleop:
             self.stop()
 
     def hand_over(self, now_us: int) -> None:
-        """Release the robot and arm it for the vision service: the one way back to autonomy."""
+        """Release the robot and arm it for the vision service. This is the only way back to autonomy."""
         self._let_go()
         self.mode, self.note = Mode.HANDING_OVER, ""
         self._repeat_request(Verb.RELEASE, now_us, _HAND_OVER_FOR_US)
@@ -437,13 +438,13 @@ class Teleop:
 
     @property
     def has_left(self) -> bool:
-        """Return whether the operator may go: the lease is released, and no STOP is without proof."""
+        """Return True if the operator may leave: the lease is released, and no STOP is unproven."""
         return self._has_released and not self.is_stopping
 
     def leave(self) -> Iterator[Message]:
-        """Yield the last messages, until `has_left`: STOP while nothing proves it, zero, the release of the lease.
+        """Yield the last messages, until `has_left`: STOP while it is not proven, zero, the release of the lease.
 
-        While another driver has the lease, only STOP.
+        While another driver holds the lease, only STOP.
         """
         if self.is_stopping:
             yield self._request(Verb.STOP)
@@ -453,27 +454,27 @@ class Teleop:
         if self.mode is Mode.DRIVING and self._echo is not None:
             yield self._command(STILL, self._echo)
         if not self._leaving:
-            self._leaving, self.mode = True, Mode.HANDING_OVER  # one zero: a second would take the lease again
+            self._leaving, self.mode = True, Mode.HANDING_OVER  # only one zero, because a second would take the lease
             self._requested_from_id = self._id + 1
         yield self._request(Verb.RELEASE)
 
     def _drive(self, fresh: bool, now_us: int) -> None:
-        """Take over for a movement key; a fresh press arms."""
+        """Take over for a movement key. A fresh press also arms."""
         took_over = self.mode is not Mode.DRIVING
         self.mode = Mode.DRIVING
         if fresh or took_over:
             self.note = ""
-            # Also if the robot seems armed: the status may precede a release.
+            # Also if the status shows an armed robot, because it may precede a release.
             self._repeat_request(Verb.ARM, now_us, _ARM_FOR_US)
         if took_over:
             self._speed_up, self._sent = SpeedUp(), STILL
         if self._sent == STILL:
             self._due_us = 0
 
-    # --- what goes out -------------------------------------------------------------------------------------------
+    # --- outputs -------------------------------------------------------------------------------------------------
 
     def messages(self, now_us: int) -> Iterator[Message]:
-        """Yield the messages to send now; call it every few milliseconds and after every input."""
+        """Yield the messages to send now. Call it every few milliseconds and after every input."""
         if self.is_stopping and now_us >= self._request_due_us:
             self._request_due_us = now_us + _REPEAT_AFTER_US
             yield self._request(Verb.STOP)
@@ -491,7 +492,7 @@ class Teleop:
         yield from self._requests(now_us)
 
     def _goal(self, now_us: int) -> Twist:
-        """Return the twist of the held key or stick at the present speeds."""
+        """Return the twist of the held key or stick at the current speeds."""
         if self.mode is not Mode.DRIVING:
             return STILL
         held = self.layout.moves[self._hold.key] if self._hold.is_held(now_us) else (0, 0)
@@ -509,7 +510,7 @@ class Teleop:
             yield self._request(verb)
 
     def _may_request(self, verb: Verb, now_us: int) -> bool:
-        """Repeat a request; one that permits motion cites a status, so one must have come."""
+        """Return True if a request may be sent again. One that permits motion needs a received status to cite."""
         return now_us >= self._request_due_us and (verb is Verb.RELEASE or self.report is not None)
 
     def _repeat_request(self, verb: Verb, now_us: int, for_us: int) -> None:

@@ -1,6 +1,6 @@
-"""Reads a gamepad with a dead man's button from Linux's input devices, as shares of the speeds. Shell.
+"""Reads a gamepad with a dead man's button from a Linux input device, as shares of the speeds. Shell.
 
-Source of the codes: linux/input-event-codes.h, which gamepads of all makers use.
+Source of the codes: linux/input-event-codes.h, which all gamepads use.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ ABS_X, ABS_Y, ABS_RX = 0, 1, 3
 BTN_SOUTH, BTN_EAST, BTN_TL, BTN_TR = 0x130, 0x131, 0x136, 0x137
 _DEAD_MAN: Final = frozenset((BTN_TL, BTN_TR))
 _DEAD_ZONE: Final = 0.12
-"""Sticks rarely return to their exact center."""
+"""Share of the axis around the center that counts as zero, because sticks rarely return to their exact center."""
 
 
 class PadKey(Enum):
-    """Buttons that act when pressed."""
+    """Buttons with an action when pressed."""
 
     STOP = "stop"
     HAND_OVER = "hand over"
@@ -38,7 +38,7 @@ _BUTTONS: Final = {BTN_EAST: PadKey.STOP, BTN_SOUTH: PadKey.HAND_OVER}
 class Pad:
     """Left stick: forward and back. Either stick sideways: turning. Hold a shoulder button to drive.
 
-    `ranges` are the (least, most) of each axis, as the device reports them.
+    `ranges` are the (least, most) values of each axis, from the device.
     """
 
     ranges: dict[int, tuple[int, int]]
@@ -47,7 +47,7 @@ class Pad:
     _stopped: bool = False
 
     def on_event(self, kind: int, code: int, value: int) -> PadKey | None:
-        """Take one event. Returns a button that acts. After STOP, the shoulder button must be pressed again."""
+        """Process one event. Returns a button with an action. After STOP, a shoulder button must be pressed again."""
         if kind == EV_ABS and code in self.ranges:
             self._axes[code] = self._share(code, value)
         elif (kind, code) == (EV_SYN, SYN_DROPPED):
@@ -85,7 +85,7 @@ _ANY: Final = "auto"
 
 
 class Gamepad:
-    """An open device; `fileno` for `select`."""
+    """An open input device; `fileno` is for `select`."""
 
     def __init__(self, path: str) -> None:
         """Open `path`, or the first gamepad for "auto". Raises HardwareError, and ConfigError without evdev."""
@@ -104,7 +104,7 @@ class Gamepad:
         return int(self._device.fd)
 
     def read(self) -> list[PadKey]:
-        """Take the waiting events. Raises HardwareError when the gamepad is gone."""
+        """Process the waiting events. Raises HardwareError if the gamepad is gone."""
         try:
             events = [(one.type, one.code, one.value) for one in self._device.read()]
         except BlockingIOError:

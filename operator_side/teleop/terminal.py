@@ -25,11 +25,11 @@ from sightline.protocol.messages import LeaseHolder, Status
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 
 _SILENT_US: Final = 1_000_000
-"""Ten times the period of a robot's status."""
+"""Silence after which the state is unknown: ten times the period of a robot's status."""
 
 
 def live_lines(robot: str, teleop: Teleop, width: int, now_us: int) -> tuple[str, str]:
-    """Format two lines, each cut to `width`: the state and its reason; the driver, frame age, wheels and speeds.
+    """Format two lines, each cut to `width`: state and reason; driver, frame age, wheels and speeds.
 
     The state of a silent robot is unknown, so it is not shown.
     """
@@ -69,18 +69,18 @@ def _driver(teleop: Teleop, status: Status) -> str:
 
 # --- the terminal ------------------------------------------------------------------------------------------------
 #
-# One thread and one `select`: a key, a frame, a status or a reply wakes it; the callbacks of the transport only store.
+# One thread and one `select`: a key, a frame, a status or a reply wakes it. Callbacks of the transport only store data.
 
 
 _TICK_S: Final = 0.01
 _SHOW_US: Final = 100_000
-_ALL: Final = 4096  # the buffer of a terminal, so that many late keys are one read
+_ALL: Final = 4096  # size of a terminal's buffer, so that one read returns all late keys
 _LEAVE_S: Final = 0.25
-"""The last messages are repeated for this time, unless the robot answers."""
+"""Time for which the last messages are repeated, unless the robot answers."""
 _PROVE_STOP_S: Final = 1.5
-"""A STOP that nothing has proven is repeated for this time after the end."""
+"""Time after the end for which an unproven STOP is repeated."""
 _LEAVE_PERIOD_S: Final = 0.03
-_ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP)  # suspended, it would read no STOP key
+_ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP)  # a suspended teleop reads no STOP key
 
 
 def check_terminal() -> None:
@@ -100,7 +100,7 @@ class Cockpit:
         Args:
             link: open link with the role of teleop.
             teleop: the session.
-            send_stop: begins to send STOP datagrams.
+            send_stop: starts the sending of STOP datagrams.
             gamepad: an open gamepad.
         """
         self._link, self._teleop, self._gamepad = link, teleop, gamepad
@@ -121,17 +121,17 @@ class Cockpit:
 
         def store(message: Message) -> None:
             slot.put(message)
-            with suppress(BlockingIOError):  # a full pipe also wakes the thread
+            with suppress(BlockingIOError):  # a full pipe wakes the thread, too
                 os.write(self._wake, b".")
 
         self._link.subscribe(channel, store)
         return slot
 
     def run(self) -> None:
-        """Drive until Q, Ctrl-C, a signal or the end of the terminal; then command zero and release the robot.
+        """Drive until Q, Ctrl-C, a signal or the end of the terminal. Then command zero and release the robot.
 
         Raises:
-            LinkError: the operator sent STOP, and nothing proves it.
+            LinkError: the operator sent STOP, and it is not proven.
         """
         with _signals(self._end), _cbreak(sys.stdin.fileno()), _screen() as self._print:
             self._print(self._teleop.layout.help)
@@ -143,7 +143,7 @@ class Cockpit:
                 if self._stop_sender is not None:
                     self._stop_sender.close()
                 self._print("\n\n")
-                if self._teleop.is_stopping:  # this matters more than an error that ended the drive
+                if self._teleop.is_stopping:  # more important than an error that ended the drive
                     raise LinkError(f"robot '{self._link.robot}' did not confirm STOP; cut its power by hand")
 
     def _end(self, _number: int, _frame: FrameType | None) -> None:
@@ -164,13 +164,13 @@ class Cockpit:
         self._show()
 
     def _stop_by_datagrams(self) -> None:
-        """Send STOP datagrams while a STOP is not proven; their answers prove it, too."""
+        """Send STOP datagrams while a STOP is not proven. Their answers prove it, too."""
         if self._stop_sender is not None and self._stop_sender.is_stopped:
             self._teleop.on_stopped()
         if self._teleop.is_stopping and self._stop_sender is None:
             try:
                 self._stop_sender = self._send_stop()
-            except (SightlineError, OSError, RuntimeError) as error:  # the link sends STOP without it
+            except (SightlineError, OSError, RuntimeError) as error:  # the link still sends STOP
                 self._teleop.note = f"STOP is not confirmed, repeating; {error}"
         elif not self._teleop.is_stopping and self._stop_sender is not None:
             self._stop_sender.close()
@@ -179,7 +179,7 @@ class Cockpit:
     def _read_keys(self) -> None:
         try:
             data = os.read(sys.stdin.fileno(), _ALL)
-        except OSError:  # the terminal was closed
+        except OSError:  # the terminal is closed
             data = b""
         self._teleop.on_keys(data.decode("utf-8", "replace"), monotonic_us())
         self._ended |= not data or b"\x04" in data or self._teleop.wants_to_quit
@@ -212,10 +212,10 @@ class Cockpit:
             self._shown_us = now_us
             width = shutil.get_terminal_size().columns
             first, second = live_lines(self._link.robot, self._teleop, width - 1, now_us)
-            self._print(f"\r\x1b[K{first}\n\x1b[K{second}\r\x1b[1A")  # and back up, to redraw both in place
+            self._print(f"\r\x1b[K{first}\n\x1b[K{second}\r\x1b[1A")  # and back up, to redraw both lines in place
 
     def _leave(self) -> None:
-        """Command zero and release the lease, until the robot confirms it and STOP, or a short time is over."""
+        """Command zero and release the lease, until the robot confirms release and STOP, or for a short time."""
         began_s = time.monotonic()
         while True:
             self._publish(self._teleop.leave())
@@ -234,13 +234,13 @@ def _drain(pipe: int) -> None:
 
 @contextmanager
 def _screen() -> Iterator[Callable[[str], None]]:
-    """Yield a function that writes to the terminal, unless it is gone or full: neither may delay a command.
+    """Yield a function that writes to the terminal. A missing or full terminal must not delay a command.
 
-    The terminal is opened again, since other programs share the mode of its first descriptor.
+    The terminal is opened again, because other programs share the mode of its first descriptor.
     """
     try:
         screen = os.open(os.ttyname(sys.stdout.fileno()), os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
-    except OSError:  # within a container the terminal may have no name
+    except OSError:  # in a container the terminal may have no name
         screen = os.dup(sys.stdout.fileno())
 
     def write(text: str) -> None:
@@ -256,12 +256,13 @@ def _screen() -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def _cbreak(terminal: int) -> Iterator[None]:
-    """Read keys immediately and without echo; Ctrl-C stays a signal. Restores the terminal at the end.
+    """Read keys immediately and without echo; Ctrl-C stays a signal. Restore the terminal at the end.
 
-    Keys pressed before count as little as those after: nothing was on the screen yet, and the shell must not get them.
+    Keys before the start are discarded, because nothing was shown yet. Keys at the end are, too, so that the shell does
+    not get them.
     """
     before = termios.tcgetattr(terminal)
-    tty.setcbreak(terminal, termios.TCSANOW)  # TCSAFLUSH would wait for a terminal that does not take its output
+    tty.setcbreak(terminal, termios.TCSANOW)  # TCSAFLUSH would wait for a terminal that does not read its output
     termios.tcflush(terminal, termios.TCIFLUSH)
     try:
         yield
