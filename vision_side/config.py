@@ -18,7 +18,7 @@ Seconds = Annotated[float, Field(ge=0, le=60)]
 
 
 class HsvRange(Config):
-    """One two-sided color range. A hue range whose low end is above its high end goes through red (360 = 0)."""
+    """One two-sided color range. A hue range whose low end is above its high end includes red (360 = 0)."""
 
     hue_low_deg: HueDeg
     hue_high_deg: HueDeg

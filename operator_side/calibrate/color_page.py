@@ -133,8 +133,7 @@ def of_picture(path: Path) -> list[Image]:
 
 
 def of_video(path: Path, frames: int) -> list[Image]:
-    """Read `frames` images spread evenly over a video, or all of a shorter one. Raises ConfigError for an invalid one.
-    """
+    """Read `frames` images spread evenly over a video, or all of a shorter one. Raises ConfigError for a bad file."""
     if not path.is_file():
         raise ConfigError(f"{path} is not a file; name a video")
     quiet_videos(cv2)

@@ -301,8 +301,7 @@ def _indented(checks: "Sequence[Check]") -> list[str]:
 
 
 _BOUND_US = {"zenoh": 1_000.0, "oip+http": 2_000.0}
-"""Limit of the median time that a warm remote detector on the same machine may add. Others are shown without a limit.
-"""
+"""Limit of the median time that a warm remote detector on the same machine may add. Others have no limit."""
 
 
 def detector(

@@ -244,8 +244,7 @@ def _source(
     robot: tuple[str | None, list[str] | None, str],
     seconds: float,
 ) -> tuple[Iterator[bytes], dict[str, float]]:
-    """Open the images and return them with the known mounting. Raises ConfigError unless there is exactly one source.
-    """
+    """Open the images and return them with the known mounting. Raises ConfigError unless one source is given."""
     from sightline.operator_side.calibrate import camera as sources
 
     if sum((folder is not None, plugin[0] is not None, robot[:2] != (None, None))) != 1:

@@ -102,8 +102,7 @@ def status(
 def follow_status(
     missions: "MissionClient", *, verbose: bool, as_json: bool = False, ends_s: float = float("inf")
 ) -> int:
-    """Show a robot's status, or its silence, until `ends_s` (monotonic) or Ctrl-C. On a terminal it redraws in place.
-    """
+    """Show a robot's status, or its silence, until `ends_s` (monotonic) or Ctrl-C; in place on a terminal."""
     from sightline.operator_side.terminal import LiveBlock
 
     with LiveBlock() as live:

@@ -43,8 +43,7 @@ def watch_page(link: Link, role: str, first: Channel, port: int, secure: str) ->
 
 
 def state_of(robot: str, missions: MissionClient, is_online: bool) -> dict[str, Any]:
-    """Return the text next to the image. It is empty for a silent robot (`is_online` is False), whose state is unknown.
-    """
+    """Return the text next to the image. Without `is_online` it is empty, because the state is unknown."""
     report = missions.operator.report if is_online else None
     lines = _robot_lines(report.status) if report is not None else []
     mission = missions.newest(0.0)

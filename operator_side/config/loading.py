@@ -317,8 +317,7 @@ def load_service(
 
 
 def _implied(loaded: Loaded) -> Iterator[Given]:
-    """Yield implied values: a robot that connects need not listen, and a vision service that listens need not connect.
-    """
+    """Yield implied values: a robot that connects need not listen; a vision service that listens need not connect."""
     service = loaded.service
     listens, connects = (loaded.origin((name,)) != "default" for name in ("listen", "connect"))
     if service == "robot" and connects and not listens:

@@ -46,8 +46,7 @@ def toml_value(text: str) -> Any:
 
 
 def toml_text(table: Mapping[str, Any], comment: Callable[[Key], str] = lambda _key: "") -> str:
-    """Format `table` (JSON types) as TOML. None becomes a comment, because TOML has no null. `comment` adds comments.
-    """
+    """Format `table` (JSON types) as TOML. None becomes a comment, because TOML has no null. `comment` adds more."""
     return "\n".join(_lines(table, (), comment)).strip() + "\n"
 
 

@@ -84,8 +84,7 @@ class _Answers:
 
 
 def replay(path: Path, on_step: Callable[[Step], None] = lambda _step: None) -> Replayed:
-    """Replay the recording at `path` and call `on_step` for each answered frame. Raises ConfigError for another file.
-    """
+    """Replay the recording at `path`; call `on_step` for each answered frame. Raises ConfigError for another file."""
     answers = _answers(path)
     missing = _gather_cited(path, answers)
     result = Replayed(gaps=answers.gaps + missing)

@@ -182,8 +182,7 @@ FRESH_US: Final = 300_000
 
 
 def split_keys(text: str) -> list[str]:
-    """Split text from a terminal into keys. An arrow has three characters. Unknown sequences are split into characters.
-    """
+    """Split text from a terminal into keys. An arrow has three characters. Unknown sequences become single keys."""
     keys: list[str] = []
     at = 0
     while at < len(text):

@@ -268,8 +268,7 @@ class Link(Closing):
 
     @property
     def dropped(self) -> Counter[str]:
-        """Return the publications that newer ones replaced before they were sent, by channel, if the link counts them.
-        """
+        """Return the publications that newer ones replaced before they were sent, by channel, if they are counted."""
         return Counter()
 
     @property

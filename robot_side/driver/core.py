@@ -57,7 +57,7 @@ def _within(value: float) -> float:
 
 
 class DriverCore:
-    """One robot session. The shell hands in what arrives and calls `tick` at least 50 times a second."""
+    """One robot session. The shell passes the inputs and calls `tick` at least 50 times a second."""
 
     def __init__(self, config: RobotConfig, session: str, *, stopped: bool = False) -> None:
         self.config = config

@@ -1,4 +1,4 @@
-"""The STOP forwarder: a process beside a router that forwards STOP datagrams to its robots. Shell.
+"""The STOP forwarder: a process next to a router that forwards STOP datagrams to its robots. Shell.
 
 Behind a router an operator knows only the address of the router. It imports the standard library only.
 """

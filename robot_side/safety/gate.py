@@ -358,7 +358,7 @@ class SafetyGate:
         if missing:
             raise WireError(RejectReason.NOT_ALLOWED, missing)
         self.arms_itself = self.config.auto_arm
-        # An operator who arms has looked at the robot. `auto_arm` has not.
+        # An operator who arms has looked at the robot, so the repeats start again. `auto_arm` does not restart them.
         self._repeats = RepeatRecord()
         self._begin(f"armed by {who.source}", now_us)
         return "armed"

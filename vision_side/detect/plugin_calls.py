@@ -106,7 +106,7 @@ def notices_of(detector: Any) -> list[str]:
 
 
 def labels_of(detector: Any) -> Sequence[str]:
-    """Return all labels that a detector can give; empty where they are unknown."""
+    """Return all labels that a detector can give; empty if they are unknown."""
     with plugin_guard("the detector's labels"):
         labels: object = getattr(detector, "labels", None) or ()
         if isinstance(labels, str) or not isinstance(labels, Iterable):

@@ -145,7 +145,7 @@ class DetectFrame:
         self._picture = picture
         self.goes_by: LabelTest = _any_label  # the pipeline sets the test of the robot's mission
         self.expected_px: tuple[float, float] | None = None
-        """Where the followed target is expected, (x, y) in px of the encoded image; the pipeline sets it."""
+        """Expected place of the followed target, (x, y) in px of the encoded image; the pipeline sets it."""
         self.looks_once = False
         """True in a detector service: a second run would cost the other robots their time."""
 
@@ -224,7 +224,7 @@ class Detector(Protocol):
         attach(link)  called with the link of each robot before its first frame
         close()       called once at the end
         missing()     on the class; returns why it cannot work here, e.g. a missing package, or ""
-        read_model(config)  on the class; loads what `config` names, so that a check of the configuration finds errors
+        read_model(config)  on the class; loads the model of `config`, so that a configuration check finds its errors
         waits = True  on the class, if it waits for another service; each robot then gets its own detector and thread
     """
 

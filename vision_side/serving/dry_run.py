@@ -98,7 +98,7 @@ class ScansOnly(MissionChannel):
     """Accepts no missions and publishes no reports, because this service does not drive the robot."""
 
     def prepare(self, pipeline: Pipeline, frame: FrameHeader, waited_us: int = 0) -> None:
-        """Give `pipeline` the newest scan."""
+        """Pass the newest scan to `pipeline`."""
         self._give_scan(pipeline, frame, waited_us)
 
     def report(self, *_given: object) -> None:

@@ -107,7 +107,7 @@ class LegacyRobotLink(LinkWrapper):
         self._state, self._reason = State.ACTIVE, _DRIVING
         self._applied = (0.0, 0.0)
         self._is_at_rest, self._zero_us = False, 0
-        """Whether zero is delivered since the last motion, and the time of the first zero after it."""
+        """True if zero is delivered since the last motion, and the time of the first zero after the motion."""
         self._connection = ""
         self._accepted = 0
         self._seqs = {STATUS: 0, REPLY: 0}

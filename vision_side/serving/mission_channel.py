@@ -239,7 +239,7 @@ class MissionChannel:
         self._link.publish(REPORT, encode(header), encode(report), SOURCE)
 
     def log_notices(self) -> None:
-        """Log what the detector reports."""
+        """Log the notices of the detector."""
         for line in notices_of(self._detector):
             self._log_change("detector", f"detector: {line}")
 

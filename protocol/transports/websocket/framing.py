@@ -34,8 +34,7 @@ _ALONE: Final = re.compile(rb'\{"channel":"([^"\\]{1,64})"(?:,"source":"([^"\\]{
 
 
 class Hello(WireModel):
-    """Names a peer and its wanted channels. It is the first message in each direction. A change of `wants` repeats it.
-    """
+    """Names a peer and its wanted channels. It is the first message each way. A change of `wants` repeats it."""
 
     v: Version = VERSION
     robot: RobotId = Field(description="the robot's id; from a connecting peer the robot that it requests")

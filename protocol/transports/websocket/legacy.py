@@ -117,8 +117,7 @@ class LegacyToVision:
         self._driver_slot.leave(self._who)
 
     def _twist(self, text: bytes) -> IncomingMessage:
-        """Convert a twist. Other text stays unchanged, so that the robot rejects it and shows the reason in `status`.
-        """
+        """Convert a twist. Other text stays unchanged: the robot rejects it and shows the reason in `status`."""
         try:
             twist = parse_dashed(text, self._options.swapped) if self._options.dashed else parse_twist(text)
         except WireError:

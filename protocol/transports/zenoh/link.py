@@ -253,8 +253,7 @@ class ZenohLink(BaseLink):
 
 
 def declare_token(session: zenoh.Session, token: AnyToken) -> Callable[[], None]:
-    """Declare a token. It ends with a call of the returned function, which the caller must store, or with the session.
-    """
+    """Declare a token. It ends with the session, or with a call of the returned function. The caller must store it."""
     import zenoh
 
     # Zenoh ends a token whose object is no longer referenced. The closure holds a reference.

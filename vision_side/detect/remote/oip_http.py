@@ -90,8 +90,7 @@ def read_metadata(body: bytes) -> OipModel:
 
 
 def infer_body(model: OipModel, tensor: OipTensor, number: str) -> tuple[int, bytes]:
-    """Return the body of `POST v2/models/NAME/infer`, and its number of JSON bytes. The answer repeats the id `number`.
-    """
+    """Return the body of `POST v2/models/NAME/infer` and its number of JSON bytes. The answer repeats `number`."""
     head = json.dumps({
         "id": number,
         "inputs": [{"name": tensor.name, "shape": tensor.shape, "datatype": tensor.datatype,
