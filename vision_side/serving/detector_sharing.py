@@ -3,8 +3,7 @@
 Each service computes the same order of services for a robot (`assignment.ranked`) from the tokens of all services. The
 first one serves the robot. A service stops serving a robot only after an earlier service in the order has answered it.
 So a service that joins, or falsely claims to, leaves no robot without answers. The next two services receive the
-answers for the robot. A later service subscribes only if none of the services before it answers any robot for a time
-that grows with its place.
+answers for the robot. A later service subscribes only if the N services before it answer no robot for N seconds.
 """
 
 from collections.abc import Iterable

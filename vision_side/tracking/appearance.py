@@ -14,7 +14,7 @@ Look = NDArray[np.float32]
 
 OTHER: Final = 0.4
 """Difference of two looks from which they belong to two objects (docs/explanation/decisions/0013-identity.md)."""
-# Bins of the red and green shares, for each of both. Finer bins would separate a yellow ball from itself under a lamp.
+# Number of bins per share (red, green). Finer bins would separate a yellow ball from itself under a lamp.
 _BINS = 8
 # Used share of the width and height of a box, because its corners show the background of a ball.
 _MIDDLE = 0.6
