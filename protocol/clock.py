@@ -93,7 +93,7 @@ class RobotClock:
         return self._replaces(self._current, seq, t_us, now_us)
 
     def _replaces(self, current: _Timeline, seq: int, t_us: int, now_us: int) -> bool:
-        """Collect messages with other times. They replace the current times if they last and those are silent."""
+        """Collect messages with other times. If they last while the current times are silent, they replace these."""
         if self._other is None or not self._other.fits(seq, t_us, now_us):
             self._other = _Timeline(seq, t_us, now_us)
         self._other.extend(seq, t_us, now_us)

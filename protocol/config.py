@@ -139,7 +139,7 @@ class PluginRegistry:
 
 
 def config_model(plugin: Any) -> type[BaseModel] | None:
-    """Return the `Config` of the class, or None without one."""
+    """Return the `Config` of the class, or None if it has no `Config`."""
     settings = getattr(plugin, "Config", None)
     return settings if isinstance(settings, type) and issubclass(settings, BaseModel) else None
 

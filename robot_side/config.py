@@ -57,7 +57,7 @@ class RobotConfig(Config):
     range_sensor: PluginChoice | None = None
     """Range sensor; default: the simulated sensor with a simulated drive, else no sensor. Kind "none" disables it."""
     battery: PluginChoice | None = None
-    """Battery sensor; without one the robot does not measure its battery."""
+    """Battery sensor. Without it the robot does not measure its battery."""
     legacy: LegacyConfig = LegacyConfig()
     safety: SafetyConfig = SafetyConfig()
     guard: GuardConfig = GuardConfig()

@@ -89,7 +89,7 @@ def raw_px(target: Detection) -> Point:
 
 
 def radius_px(target: Detection) -> float:
-    """Return the radius of the circle, or without one that of a disk with the area of the box, in px."""
+    """Return the radius of the circle. Without a circle: the radius of a disk with the area of the box, px."""
     if target.circle is not None:
         return target.circle.radius_px
     return math.sqrt(max(0.0, (target.x2_px - target.x1_px) * (target.y2_px - target.y1_px)) / math.pi)

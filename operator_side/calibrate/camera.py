@@ -258,7 +258,7 @@ class Collected(Generic[Found]):
 def folder_pictures(folder: Path) -> Iterator[bytes]:
     """Yield the JPEGs of `folder` in name order.
 
-    Raises HardwareError without a JPEG, and ConfigError for an unreadable or damaged one, or one of another size.
+    Raises HardwareError without a JPEG, and ConfigError for a JPEG that is unreadable, damaged or of another size.
     """
     first: JpegSize | None = None
     for path in jpegs_in(folder):
@@ -301,7 +301,7 @@ def robot_pictures(link: Link, seconds: float, role: str = ROLE, secure: str = "
 
 
 def robot_model(link: Link, timeout_s: float = 3.0) -> CameraModel:
-    """Return the model that a robot publishes. Raises LinkError without one."""
+    """Return the model that a robot publishes. Raises LinkError without a model."""
     message = link.latest(CAMERA).take(timeout_s)
     try:
         if message is not None:
@@ -327,7 +327,7 @@ def collect(
         is_live: skip damaged images, and images that flow control has scaled; start again with the first larger image.
 
     Raises:
-        ConfigError: there is no image, or one is damaged or of another size and `is_live` is False.
+        ConfigError: there is no image, or an image is damaged or of another size and `is_live` is False.
     """
     found: list[Found] = []
     size, given, skipped, repeated = None, 0, 0, 0

@@ -258,7 +258,7 @@ def own_stop_addresses(listen: Sequence[str]) -> list[tuple[str, int]]:
     """Return the UDP addresses of the STOP ports to open for `listen`.
 
     Raises:
-        ConfigError: an address is that of discovery. Only one of the two could be opened.
+        ConfigError: an address is also the address of discovery. Only one of the two could be opened.
     """
     for endpoint in listen if uses_discovery(listen) else ():
         if any((host, MULTICAST_PORT) in stop_addresses([endpoint]) for host in ("0.0.0.0", "::")):

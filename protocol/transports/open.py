@@ -46,7 +46,7 @@ def open_link(
         session: session id of this end, 8 hex digits, if it has published one already.
 
     Returns:
-        The link; with endpoints of several transports a link over all of them.
+        The link. With endpoints of several transports it joins all of them.
 
     Raises:
         ConfigError: an argument is invalid, or an optional package is missing.

@@ -42,7 +42,7 @@ _TLS: Final = ("tls", "quic")
 
 
 def certificate_role(source: str) -> str:
-    """Return the certificate of a link with role `source`. An unknown role uses that of a viewer."""
+    """Return the certificate for a link with role `source`. An unknown role uses the certificate of a viewer."""
     if source in (ROBOT_ROLE, ROUTER_ROLE):
         return source
     return next((role for role, sources in SOURCES_OF_ROLE.items() if source in sources), "viewer")
@@ -281,7 +281,7 @@ def read_tokens(folder: str) -> Mapping[str, str]:
 
 
 def own_token(folder: str, source: str) -> str:
-    """Return the token that a link of role `source` shows when it connects, or "" without one."""
+    """Return the token that a link of role `source` shows when it connects, or "" without a token."""
     file = home_path(folder) / f"{certificate_role(source)}.token"
     return _read(file) if folder and file.is_file() else ""
 

@@ -180,7 +180,7 @@ def stop_secret_file(folder: str) -> str:
     """Return the path of the STOP secret in a folder from `sightline keys`.
 
     Raises:
-        ConfigError: the folder has no such file, as those of earlier releases, or an invalid one.
+        ConfigError: the file is missing, as in folders of earlier releases, or invalid.
     """
     file = home_path(folder) / STOP_SECRET_FILE
     if not file.is_file():

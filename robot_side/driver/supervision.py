@@ -57,7 +57,7 @@ def limit_core_dump() -> None:
 
 
 class SystemdNotifier:
-    """systemd's notification socket (sd_notify(3)); without one every call does nothing."""
+    """systemd's notification socket (sd_notify(3)). Without the socket every call does nothing."""
 
     def __init__(self) -> None:
         address = os.environ.get("NOTIFY_SOCKET", "")

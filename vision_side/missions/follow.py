@@ -104,7 +104,7 @@ class Follow:
         ]
 
     def _is_box(self, one: Detection, view: View) -> bool:
-        """Return True for a box: any detection without pixels, or one without an outline if a size is configured."""
+        """Return True for a box: a detection without pixels, or without an outline if a size is configured."""
         sizes = self._sizes
         sized = sizes.height_m is not None or sizes.width_m is not None
         return view.picture is None or (sized and one.outline_px is None)

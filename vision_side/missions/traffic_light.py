@@ -223,7 +223,7 @@ class TrafficLight:
         return max(0.0, (self._camera.cy_px - box.y2_px) / self._camera.fy_px + self._camera.pitch_rad)
 
     def _is_known(self, place: Place, pose: Pose) -> bool:
-        """Return True if a place is that of the known light."""
+        """Return True if `place` is the place of the known light."""
         off_m = math.dist(place, self._light) if self._light else math.inf
         return off_m <= _SAME_M + _SAME_SHARE * math.dist(place, pose[:2])
 

@@ -62,7 +62,7 @@ class FairQueue(Generic[Item]):
         self.counters: dict[str, FrameCounters] = {}
 
     def offer(self, robot: str, item: Item, now_us: int) -> None:
-        """Store the newest frame of `robot`. It replaces the one that waits."""
+        """Store the newest frame of `robot`. It replaces the waiting frame."""
         counters = self.counters.setdefault(robot, FrameCounters())
         counters.offered += 1
         counters.overtaken += self._waiting.get(robot) is not None
@@ -143,7 +143,7 @@ class BatchClock:
         """Begin to examine a batch.
 
         Returns:
-            The frames without those whose boxes would come after their deadline, and the earliest deadline, us.
+            The frames whose boxes can come before their deadline, and the earliest deadline, us.
         """
         fresh = [turn for turn in batch if not _is_too_old(turn, now_us, self.each_us, self._deadline_us)]
         if fresh:

@@ -166,7 +166,7 @@ class _Place:
 
 
 class Track:
-    """Follows at most one target. `target` is None without one."""
+    """Follows at most one target. `target` is None without a target."""
 
     def __init__(self, config: TrackConfig) -> None:
         self._config = config
@@ -189,7 +189,7 @@ class Track:
         Args:
             dt_s: time since the last frame.
             pose: odometry at capture, m, m, rad.
-            sightings: candidates, best first. The best one starts a track; the one that fits best continues it.
+            sightings: candidates, best first. The best sighting starts a track; the best fit continues it.
             number: number of this frame.
 
         Returns:

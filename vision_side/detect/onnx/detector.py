@@ -93,7 +93,7 @@ class OnnxDetector:
         threads: Annotated[int, Field(ge=1, le=64)] = 1
         """Threads on the CPU. To split a small image only costs time."""
         min_score: Annotated[float | None, Field(ge=0, le=1)] = None
-        """None: `min_score` of the model's metadata, or 0.25 without one."""
+        """None: `min_score` of the model's metadata, or 0.25 if it is missing there."""
         names: Annotated[tuple[str, ...], Field(max_length=1000)] = ()
         """The labels, in order, or `coco` or `coco91`; empty for the labels of the model's metadata."""
         color: Literal["auto", "bgr", "rgb"] = "auto"

@@ -175,7 +175,7 @@ class ZenohDetector(FrameByFrame):
         raise NoAnswerError(NoAnswerReason.LATE, f"no boxes from {self._config.source} by the deadline; does it run?")
 
     def _read(self, message: Message, frame: DetectFrame, is_other: bool) -> "_Answer | None":
-        """Return the boxes; None for those of another frame.
+        """Return the boxes, or None for boxes of another frame.
 
         Raises NoAnswerError for invalid boxes of the preferred service. Other invalid boxes are only counted, because
         the wait for valid boxes must continue.
