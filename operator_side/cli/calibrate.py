@@ -178,7 +178,9 @@ def register(app: typer.Typer) -> None:
 
 def camera(
     *,
-    pictures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of JPEG images.")] = None,
+    pictures: Annotated[
+        Path | None, typer.Option("--images", "--pictures", metavar="DIR", help="Folder of JPEG images.")
+    ] = None,
     camera: CameraKind = None,
     camera_sets: CameraSets = None,
     robot: RobotName = None,
@@ -202,7 +204,7 @@ def camera(
 ) -> None:
     """Measure a camera and write its model
 
-    Use a chessboard, or a ball of known size and distance. Images come from --pictures, --camera or a running robot.
+    Use a chessboard, or a ball of known size and distance. Images come from --images, --camera or a running robot.
     """
     check_out_file(out)
     check_camera_sets(camera, camera_sets)
@@ -248,7 +250,7 @@ def _source(
     from sightline.operator_side.calibrate import camera as sources
 
     if sum((folder is not None, plugin[0] is not None, robot[:2] != (None, None))) != 1:
-        raise ConfigError("expected one source of images; give --pictures DIR, --camera KIND or --robot ID")
+        raise ConfigError("expected one source of images; give --images DIR, --camera KIND or --robot ID")
     if folder is not None:
         return sources.folder_pictures(folder), {}
     if plugin[0] is not None:
@@ -370,7 +372,9 @@ def pick_color(
         str | None, typer.Argument(metavar="ROBOT", help="Robot of the images [default: of `sightline use`, or r1].")
     ] = None,
     *,
-    picture: Annotated[Path | None, typer.Option("--picture", metavar="FILE", help="Use an image file.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option("--image", "--picture", metavar="FILE", help="Use an image file.")
+    ] = None,
     video: Annotated[Path | None, typer.Option("--video", metavar="FILE", help="Use a video file.")] = None,
     at: Annotated[str | None, typer.Option("--at", metavar="X,Y", help="Pick this pixel without a browser.")] = None,
     box: Annotated[
@@ -392,7 +396,7 @@ def pick_color(
 
     Click or draw a box on a page for a browser on this machine, or use --at or --box. It tests and prints the range.
     """
-    sources = [name for name, given in (("ROBOT", robot), ("--picture", picture), ("--video", video)) if given]
+    sources = [name for name, given in (("ROBOT", robot), ("--image", picture), ("--video", video)) if given]
     if len(sources) > 1:
         raise ConfigError(f"{' and '.join(sources)} exclude each other; give one source of images")
     place = place_of(at, box)
@@ -404,7 +408,7 @@ def pick_color(
     if config is not None:
         check_config(config)
     mask = mask or _MASK
-    _check_mask(mask, {"--picture": picture, "--video": video, "--config": config})
+    _check_mask(mask, {"--image": picture, "--video": video, "--config": config})
     source = _Source(target_of(robot, connect, secure), picture, video)
     if place is None:
         _on_page(source, frames, config, port)

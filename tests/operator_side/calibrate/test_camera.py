@@ -140,7 +140,7 @@ def test_the_same_view_is_taken_once():
 def test_boards_that_all_stand_in_one_place_are_reported_as_that(tmp_path):
     pictures = folder(tmp_path, [tilted_view(0)] * 6)
     with pytest.raises(ConfigError, match=r"7 x 5 inner corners is in 6 of 6 images, 5 of them repeat an ear"):
-        run("--pictures", pictures, "--board", "7x5", "--out", tmp_path / "camera.toml")
+        run("--images", pictures, "--board", "7x5", "--out", tmp_path / "camera.toml")
 
 
 def test_size_of_the_squares_has_no_effect():
@@ -226,7 +226,7 @@ def test_a_live_robot_is_measured_and_keeps_its_mounting(tmp_path, capsys):
 
 def test_the_command_writes_a_model_that_a_camera_takes(tmp_path, capsys):
     pictures, out = folder(tmp_path, views()), tmp_path / "camera.toml"
-    run("--pictures", pictures, "--board", "7x5", "--square-m", 0.03, "--out", out, "--z-m", 0.12)
+    run("--images", pictures, "--board", "7x5", "--square-m", 0.03, "--out", out, "--z-m", 0.12)
     assert f"--set camera.options.model_file={out}" in capsys.readouterr().out
     still = StillCamera(StillCamera.Config(path=pictures / "00.jpg", model_file=out))
     assert still.model == read_model(out)
@@ -266,16 +266,17 @@ def test_search_in_live_images_is_announced_with_its_longest_time(
     folder(tmp_path, [EMPTY])
     monkeypatch.setattr(cli_calibrate, "_measure", lambda *_, **__: Calibration(TRUTH, 8, 9, 0.1, "px RMS"))
     live = ("--camera", "still", "--camera-set", f"path={tmp_path / '00.jpg'}", "--seconds", seconds)
-    run(*live if seconds else ("--pictures", tmp_path), *given, "--out", tmp_path / "camera.toml")
+    run(*live if seconds else ("--images", tmp_path), *given, "--out", tmp_path / "camera.toml")
     line = f"searching the live images for {subject}, for 7 s at most; Ctrl-C ends it"
     lines = [one for one in capsys.readouterr().out.splitlines() if one.startswith("search")]
     assert lines == ([line] if seconds and subject else [])
 
 
-def test_no_board_found_is_one_line(tmp_path):
+@pytest.mark.parametrize("option", ["--images", "--pictures"])  # the second is its former name
+def test_no_board_found_is_one_line(tmp_path, option):
     out = tmp_path / "camera.toml"
     with pytest.raises(ConfigError, match=r"no board in 3 images: .* a chessboard of 9 x 6 inner corners") as error:
-        run("--pictures", folder(tmp_path, [EMPTY] * 3), "--out", out)
+        run(option, folder(tmp_path, [EMPTY] * 3), "--out", out)
     assert "\n" not in str(error.value)
     assert not out.exists()
 
@@ -284,17 +285,17 @@ def test_bad_output_file_is_reported_before_the_measurement(tmp_path):
     pictures = folder(tmp_path, [EMPTY])
     for out, words in ((tmp_path, "is a folder"), (tmp_path / "none" / "camera.toml", "no folder")):
         with pytest.raises(ConfigError, match=words):
-            run("--pictures", pictures, "--out", out)
+            run("--images", pictures, "--out", out)
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         ((), "expected one source of images"),
-        (("--pictures", ".", "--camera", "v4l2"), "expected one source of images"),
-        (("--pictures", ".", "--board", "9"), "invalid --board"),
-        (("--pictures", ".", "--board", "2x9"), "invalid --board"),
-        (("--pictures", ".", "--ball-radius-m", "0.1"), "both --ball-radius-m and --distance-m"),
+        (("--images", ".", "--camera", "v4l2"), "expected one source of images"),
+        (("--images", ".", "--board", "9"), "invalid --board"),
+        (("--images", ".", "--board", "2x9"), "invalid --board"),
+        (("--images", ".", "--ball-radius-m", "0.1"), "both --ball-radius-m and --distance-m"),
         (("--camera", "still", "--camera-set", "path"), "invalid --camera-set"),
         (("--camera", "v4l3"), "did you mean 'v4l2'"),
     ],
@@ -311,7 +312,7 @@ def test_bad_usage_is_one_line(arguments, said):
 def test_impossible_mounting_is_reported_before_the_measurement(tmp_path, monkeypatch, option, value, words):
     monkeypatch.setattr(cli_calibrate, "_source", lambda *_: pytest.fail("measured"))
     with pytest.raises(ConfigError, match=words):
-        run("--pictures", tmp_path, "--out", tmp_path / "camera.toml", option, value)
+        run("--images", tmp_path, "--out", tmp_path / "camera.toml", option, value)
 
 
 def test_model_that_cannot_be_written_is_printed_and_the_earlier_one_stays(tmp_path, monkeypatch, capsys):
@@ -327,7 +328,7 @@ def test_model_that_cannot_be_written_is_printed_and_the_earlier_one_stays(tmp_p
 
     monkeypatch.setattr(type(out), "write_bytes", on_a_full_disk)
     with pytest.raises(ConfigError, match=f"cannot write {out}: No space left on device; choose another --out"):
-        run("--pictures", pictures, "--out", out)
+        run("--images", pictures, "--out", out)
     printed = capsys.readouterr().err.partition("the measured model is:\n")[2]
     assert CameraModel.model_validate_json(json.dumps(tomllib.loads(printed))) == TRUTH
     assert out.read_text() == "earlier" and sorted(path.name for path in tmp_path.iterdir()) == ["00.jpg", out.name]
@@ -337,17 +338,17 @@ def test_images_of_two_sizes_are_rejected(tmp_path):
     small = jpeg_of(np.full((240, 320, 3), 120, np.uint8))
     pictures = folder(tmp_path, [EMPTY, small])
     with pytest.raises(ConfigError, match=f"{pictures}/01.jpg: images of .* are mixed"):
-        run("--pictures", pictures)
+        run("--images", pictures)
 
 
 def test_image_that_cannot_be_used_is_named(tmp_path):
     pictures = folder(tmp_path, [EMPTY, b"no JPEG"])
     with pytest.raises(ConfigError, match=f"{pictures}/01.jpg: invalid JPEG: .*; remove or convert it"):
-        run("--pictures", pictures)
+        run("--images", pictures)
     (pictures / "01.jpg").unlink()
     (pictures / "01.jpg").mkdir()
     with pytest.raises(ConfigError, match=f"cannot read {pictures}/01.jpg: Is a directory; remove it or make it"):
-        run("--pictures", pictures)
+        run("--images", pictures)
 
 
 def test_the_board_is_counted_in_inner_corners():

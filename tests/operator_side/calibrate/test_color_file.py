@@ -122,7 +122,7 @@ def there(tmp_path, monkeypatch):
 
 def test_click_in_an_image_gives_range_mask_and_configuration(there, capsys):
     (there / "vision.toml").write_text("# mine\n[hsv]\nshape = 'any' # all\n")
-    assert run(["pick-color", "--picture", "ball.png", "--at", "110,112", "--config", "vision.toml", "--json"]) == 0
+    assert run(["pick-color", "--image", "ball.png", "--at", "110,112", "--config", "vision.toml", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert 200 <= said["ranges"][0]["hue_low_deg"] <= 205 and said["trial"]["most_blobs"] == 1
     assert said["written"] == "vision.toml" and cv2.imread(said["mask"]).shape == (240, 640, 3)
@@ -149,28 +149,29 @@ def test_libraries_print_nothing_about_an_invalid_video():
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
-    ("--picture ball.png --at 10,10", "no color at 10,10: it is gray"),
-    ("--picture ball.png --at 400,10", "400,10 is outside the image of 320x240"),
-    ("--picture wall.png --at 10,10", "marks 100% of an image"),
-    ("--picture ball.png --at 1", "expected X,Y"),
-    ("--picture ball.png --at -1,5", "expected X,Y"),
-    ("--picture ball.png --at 1,٣", "expected X,Y"),
-    ("--picture ball.png --box 1,2,3", "expected X,Y,W,H"),
-    ("--picture ball.png --box 1,2,0,3", "expected X,Y"),
-    ("--picture ball.png --box 1,2,00,3", "expected X,Y"),
-    ("--picture ball.png --at 1,1 --box 1,1,2,2", "exclude each other"),
-    ("r1 --picture ball.png --at 1,1", "ROBOT and --picture exclude each other"),
-    ("--picture none.png --at 1,1", "cannot read none.png: No such file"),
-    ("--picture vision.toml --at 1,1", "invalid image vision.toml"),
-    ("--picture /dev/zero --at 1,1", "/dev/zero is not a file; name a PNG or JPEG"),
-    ("--picture tiny.png --at 0,0", "tiny.png has 20x2, at least 16 pixels a side"),
+    ("--image ball.png --at 10,10", "no color at 10,10: it is gray"),
+    ("--image ball.png --at 400,10", "400,10 is outside the image of 320x240"),
+    ("--image wall.png --at 10,10", "marks 100% of an image"),
+    ("--picture ball.png --at 10,10", "no color at 10,10: it is gray"),  # the former name
+    ("--image ball.png --at 1", "expected X,Y"),
+    ("--image ball.png --at -1,5", "expected X,Y"),
+    ("--image ball.png --at 1,٣", "expected X,Y"),
+    ("--image ball.png --box 1,2,3", "expected X,Y,W,H"),
+    ("--image ball.png --box 1,2,0,3", "expected X,Y"),
+    ("--image ball.png --box 1,2,00,3", "expected X,Y"),
+    ("--image ball.png --at 1,1 --box 1,1,2,2", "exclude each other"),
+    ("r1 --image ball.png --at 1,1", "ROBOT and --image exclude each other"),
+    ("--image none.png --at 1,1", "cannot read none.png: No such file"),
+    ("--image vision.toml --at 1,1", "invalid image vision.toml"),
+    ("--image /dev/zero --at 1,1", "/dev/zero is not a file; name a PNG or JPEG"),
+    ("--image tiny.png --at 0,0", "tiny.png has 20x2, at least 16 pixels a side"),
     ("--video none.mp4 --at 1,1", "is not a file; name a video"),
     ("--video vision.toml --at 1,1", "invalid video vision.toml"),
-    ("--picture ball.png --json", "add --at X,Y"),
-    ("--picture ball.png --at 110,112 --config bad.toml", "bad.toml"),
-    ("--picture ball.png --at 110,112 --mask none/mask.png", "cannot write none/mask.png"),
-    ("--picture ball.png --at 110,112 --mask ./ball.png", "--mask ball.png is also the file of --picture"),
-    ("--picture ball.png --at 110,112 --mask mask.jpg", "invalid --mask mask.jpg: expected a .png file"),
+    ("--image ball.png --json", "add --at X,Y"),
+    ("--image ball.png --at 110,112 --config bad.toml", "bad.toml"),
+    ("--image ball.png --at 110,112 --mask none/mask.png", "cannot write none/mask.png"),
+    ("--image ball.png --at 110,112 --mask ./ball.png", "--mask ball.png is also the file of --image"),
+    ("--image ball.png --at 110,112 --mask mask.jpg", "invalid --mask mask.jpg: expected a .png file"),
     ("--at 1,1 --connect nowhere", "nowhere"),
 ])
 def test_failed_pick_is_one_line_and_writes_nothing(there, capsys, arguments, words):
@@ -187,5 +188,5 @@ def test_failed_pick_is_one_line_and_writes_nothing(there, capsys, arguments, wo
 
 def test_loop_of_symbolic_links_is_one_line(there, capsys):
     (there / "loop").symlink_to("loop")
-    assert run(["pick-color", "--picture", "loop", "--at", "1,1"]) == 2
+    assert run(["pick-color", "--image", "loop", "--at", "1,1"]) == 2
     assert re.fullmatch("error: .*loop: Too many levels of symbolic links; .*\n", capsys.readouterr().err)

@@ -266,7 +266,7 @@ def test_command_whose_standard_streams_are_closed_has_the_null_device_and_so_ha
         (["watch", "r1", "target", "--show", "frame"], 2, "--show has no effect on channel 'target'"),
         (["watch", "r1", "status", "--port", "8080"], 2, "--port has no effect on channel 'status'"),
         (["doctor", "--camera-set", "device=/dev/video2"], 2, "--camera-set needs --camera; name a camera"),
-        (["calibrate", "camera", "--pictures", ".", "--camera-set", "device=x"], 2, "--camera-set needs --camera"),
+        (["calibrate", "camera", "--images", ".", "--camera-set", "device=x"], 2, "--camera-set needs --camera"),
         (["vision", "--robot", "r1/"], 2, "'r1/'"),
         (["vision", "--set", "hsv.min_radius_px=-1"], 2, "-1"),
         (["sim", "--scenario", "cirle"], 2, "'circle'"),
