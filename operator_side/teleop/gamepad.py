@@ -124,7 +124,9 @@ def _opened(evdev: Any, path: str) -> Any:
     try:
         return evdev.InputDevice(path)
     except OSError as error:
-        raise HardwareError(f"gamepad {path}: {error.strerror}; add your user to the group input") from None
+        fix = ("add your user to the group input" if isinstance(error, PermissionError)
+               else "connect it, or take the first gamepad with --gamepad auto")
+        raise HardwareError(f"gamepad {path}: {error.strerror}; {fix}") from None
 
 
 def _first(evdev: Any) -> Any:

@@ -46,6 +46,12 @@ class Device:
         self.closed = True
 
 
+REASONS = {
+    "/dev/input/event99": (errno.ENOENT, "No such file or directory"),
+    "/dev/null": (errno.ENOTTY, "Inappropriate ioctl for device"),
+}
+
+
 @pytest.fixture
 def plugged(monkeypatch):
     """Plug devices in by path."""
@@ -53,7 +59,7 @@ def plugged(monkeypatch):
 
     def opened(path):
         if path not in devices:
-            raise OSError(errno.EACCES, "Permission denied")
+            raise OSError(*REASONS.get(path, (errno.EACCES, "Permission denied")))
         return devices[path]
 
     monkeypatch.setitem(sys.modules, "evdev", SimpleNamespace(InputDevice=opened, list_devices=lambda: list(devices)))
@@ -79,6 +85,8 @@ def test_gamepad_events_are_read_and_its_end_is_an_error(plugged):
 
 @pytest.mark.parametrize(("path", "says"), [
     ("auto", "no gamepad found"), ("/dev/input/event9", "Permission denied; add your user to the group input"),
+    ("/dev/input/event99", "gamepad /dev/input/event99: No such file or directory; connect it, or take the first"),
+    ("/dev/null", "gamepad /dev/null: Inappropriate ioctl for device; connect it, or take the first gamepad with"),
     ("keys", "has no stick; name a gamepad"),
 ])  # fmt: skip
 def test_missing_gamepad_is_one_line(plugged, path, says):
