@@ -49,7 +49,7 @@ COMMANDS: Final = {
     "robots": Entry("Observe", "operate", "List robots and the services connected to them"),
     "status": Entry("Observe", "operate", "Show a robot's state and its reason"),
     "watch": Entry("Observe", "watch", "Show a robot's images or messages live"),
-    "capture": Entry("Observe", "watch", "Save an image or a video from a robot"),
+    "capture": Entry("Observe", "watch", "Save an image, a video or a recording of a robot"),
     "metrics": Entry("Observe", "services", "Serve a robot's status to Prometheus"),
     "use": Entry("Set up", "admin", "Save, show or clear the default robot address"),
     "config": Entry("Set up", "services", "Check or show a service's configuration"),

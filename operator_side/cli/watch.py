@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -33,6 +33,9 @@ from sightline.protocol.errors import ConfigError, LinkError, home_path
 from sightline.protocol.log import printable
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import open_link
+
+if TYPE_CHECKING:
+    from sightline.operator_side.recording.recorder import Recorder
 
 _TARGET = "target"
 _SHOWN = (OVERLAY.name, PREVIEW.name, FRAME.name)
@@ -166,22 +169,23 @@ def capture(
     robot: Robot = None,
     *,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="x.png, x.jpg or x.mp4 [default: ROBOT-DATE-TIME.png].")
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="x.png, .jpg, .mp4 or .mcap [default: ROBOT-DATE-TIME.png]."),
     ] = None,
     overlay: Annotated[bool, typer.Option("--overlay", help="Include the drawing of the vision service.")] = False,
     seconds: Annotated[
-        float | None, typer.Option("--seconds", min=0.1, max=3600, help="Length of a video [default: 5].")
+        float | None, typer.Option("--seconds", min=0.1, max=3600, help="Length of a video or recording [default: 5].")
     ] = None,
     connect: Connect = None,
     secure: Secure = "",
     as_json: Json = False,
 ) -> None:
-    """Save an image or a video from a robot
+    """Save an image, a video or a recording of a robot
 
-    With --seconds or an .mp4 file it saves a video. Ctrl-C ends a video early.
+    With --seconds or an .mp4 file it saves a video, with an .mcap file all messages. Ctrl-C ends both early.
     """
     with needs("vision"):
-        from sightline.operator_side.recording.film import PICTURES, check_target, film, snapshot
+        from sightline.operator_side.recording.film import MESSAGES, PICTURES, check_target, film, record, snapshot
     target = target_of(robot, connect, secure)
     robot, secure = target.robot, target.secure
     kind = "mp4" if seconds is not None else "png"
@@ -189,11 +193,16 @@ def capture(
     check_target(path, seconds)
     wanted, role = OVERLAY if overlay else FRAME, viewer_role(secure)
     with open_link(robot, connect=target.connect, role=role, secure=secure) as link:
+        length_s = _SECONDS if seconds is None else seconds
+        if path.suffix.lower() == MESSAGES:
+            recorder = record(link, Pictures(link, role, FRAME, secure), path, wanted, length_s)
+            _print_recording(robot, path, recorder, as_json)
+            return
         pictures = Pictures(link, role, wanted, secure)
         if path.suffix.lower() in PICTURES:
             got = snapshot(pictures, path, wanted)
         else:
-            got = film(pictures, path, wanted, _SECONDS if seconds is None else seconds)
+            got = film(pictures, path, wanted, length_s)
     if got.cut == "silent":
         typer.echo(f"capture: no more images after {got.seconds:.1f} s, so the video is shorter than requested; run "
                    f"`sightline status {robot}`", err=True)
@@ -204,3 +213,15 @@ def capture(
         return
     length = f", {got.frames} images in {got.seconds:.1f} s" if path.suffix.lower() == ".mp4" else ""
     typer.echo(f"{path}: {wanted.name} of {robot}, {got.width_px}x{got.height_px}{length}")
+
+
+def _print_recording(robot: str, path: Path, recorder: "Recorder", as_json: bool) -> None:
+    counts = recorder.counts
+    if recorder.dropped:
+        typer.echo(f"capture: {recorder.dropped} messages are missing, because {path} is on a slow disk", err=True)
+    if as_json:
+        typer.echo(json.dumps({"robot": robot, "file": str(path), "messages": counts, "dropped": recorder.dropped,
+                               "complete": not recorder.dropped}))
+        return
+    listed = ", ".join(f"{topic} {count}" for topic, count in sorted(counts.items()))
+    typer.echo(f"{path}: {sum(counts.values())} messages of {robot}: {listed}")

@@ -1,4 +1,4 @@
-"""Snapshots and H.264 films of a robot's images. Shell (waits, writes files)."""
+"""Snapshots, H.264 films and recordings of a robot. Shell (waits, writes files)."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ from numpy.typing import NDArray
 
 from sightline.operator_side.client.pictures import Pictures, Shot
 from sightline.operator_side.preflight import check_out_file, needs, whole, write_whole, writes
+from sightline.operator_side.recording.recorder import RECORDED, Recorder
 from sightline.protocol.channels import OVERLAY, Channel
 from sightline.protocol.errors import ConfigError, LinkError, RejectReason, WireError
 from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.transports.link import Link
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Decoder
 
@@ -136,6 +138,7 @@ class Film:
 
 PICTURES: Final = (".png", ".jpg", ".jpeg")
 VIDEO: Final = ".mp4"
+MESSAGES: Final = ".mcap"
 PATIENCE_S: Final = 5.0
 _WAIT_S: Final = 0.5
 _FPS: Final = 30
@@ -157,14 +160,16 @@ class Captured:
 
 
 def check_target(path: Path, seconds: float | None) -> None:
-    """Raise ConfigError for a file that is neither an image nor a video, or that cannot be written."""
+    """Raise ConfigError for a file that is neither image, video nor recording, or that cannot be written."""
     kind = path.suffix.lower()
-    if kind not in (*PICTURES, VIDEO):
-        raise ConfigError(f"invalid file {path}: a snapshot ends in .png or .jpg, a video in .mp4")
+    if kind not in (*PICTURES, VIDEO, MESSAGES):
+        raise ConfigError(
+            f"invalid file {path}: a snapshot ends in .png or .jpg, a video in .mp4, a recording in .mcap"
+        )
     if kind in PICTURES and seconds is not None:
         raise ConfigError(f"--seconds needs a video, and {path} is an image; use --out NAME.mp4")
     check_out_file(path)
-    if kind == VIDEO and path.exists() and not path.is_file():
+    if kind not in PICTURES and path.exists() and not path.is_file():
         raise ConfigError(f"cannot write {path}: it is a device or a pipe; name a file")
 
 
@@ -192,6 +197,30 @@ def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Cap
         if not made.frames:
             raise LinkError(_silence(pictures, wanted))
     return Captured(path, made.frames, made.seconds, *made.size_px, cut)
+
+
+def record(link: Link, pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Recorder:
+    """Write all messages of `seconds`, or until Ctrl-C, SIGTERM or SIGHUP, to `path`. `wanted` may add the overlay.
+
+    Raises LinkError if none arrives, ConfigError for a file that cannot be written to its end.
+    """
+    ends_s, has_begun = time.monotonic() + PATIENCE_S, False  # the end is counted from the first message
+    channels = dict.fromkeys((*RECORDED, wanted))
+    with (
+        _terminated_like_ctrl_c(),
+        Recorder(link, path, {"robot": link.robot}, channels) as recorder,
+        suppress(KeyboardInterrupt),
+    ):
+        while (left_s := ends_s - time.monotonic()) > 0 and not recorder.failed:
+            pictures.take(min(left_s, _WAIT_S))  # it acknowledges frames, which no client does without a vision service
+            if recorder.counts and not has_begun:
+                ends_s, has_begun = time.monotonic() + seconds, True
+    if recorder.failed:
+        raise ConfigError(f"recording {path} ends early: {recorder.failed}; free some space or name another file")
+    if not recorder.counts:
+        path.unlink()
+        raise LinkError(_silence(pictures, wanted))
+    return recorder
 
 
 def _fill(made: Film, pictures: Pictures, wanted: Channel, seconds: float) -> Cut:

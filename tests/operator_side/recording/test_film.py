@@ -5,9 +5,11 @@ import os
 import re
 import resource
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import cv2
@@ -17,9 +19,11 @@ import simplejpeg
 
 from sightline.operator_side.cli import watch
 from sightline.operator_side.client.pictures import Shot
-from sightline.operator_side.recording.film import Captured, Cut, Film, check_target, film, snapshot
-from sightline.protocol.channels import FRAME
-from sightline.protocol.errors import ConfigError
+from sightline.operator_side.recording.film import Captured, Cut, Film, check_target, film, record, snapshot
+from sightline.operator_side.recording.recorder import RECORDED, read_about, read_recording
+from sightline.protocol.channels import FRAME, OVERLAY, STATUS
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.link import Message
 from tests.fixtures.commands import run
 
 NOISE = simplejpeg.encode_jpeg(np.random.default_rng(1).integers(0, 255, (120, 160, 3), np.uint8), 90)
@@ -191,13 +195,13 @@ def test_symbolic_link_stays_one(tmp_path: Path) -> None:
     assert len(list(tmp_path.rglob("*"))) == 7
 
 
-@pytest.mark.parametrize("name", ["pipe.jpg", "link.jpg", "pipe.mp4", "link.mp4"])
+@pytest.mark.parametrize("name", ["pipe.jpg", "link.jpg", "pipe.mp4", "link.mp4", "pipe.mcap", "link.mcap"])
 def test_device_or_pipe_is_never_replaced(tmp_path: Path, name: str) -> None:
     pipe = tmp_path / f"pipe{Path(name).suffix}"
     os.mkfifo(pipe)
     (tmp_path / f"link{pipe.suffix}").symlink_to(pipe)
     with os.fdopen(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK), "rb") as reader:
-        if pipe.suffix == ".mp4":  # its index is written into the part before
+        if pipe.suffix != ".jpg":  # the index of a video is written into the part before
             with pytest.raises(ConfigError, match=f"cannot write {tmp_path / name}: it is a device or a pipe; name a"):
                 check_target(tmp_path / name, None)
         else:
@@ -249,3 +253,92 @@ def test_size_of_a_video_is_that_of_its_file(tmp_path: Path, sizes_px: list[tupl
             assert made.add(np.full((height_px, width_px, 3), 99, np.uint8), at * 100_000)
     with av.open(str(tmp_path / "run.mp4")) as file:
         assert {(frame.width, frame.height) for frame in file.decode(video=0)} == {made.size_px}
+
+
+# --- recordings --------------------------------------------------------------------------------------------------
+
+
+class Talking:
+    """A link to a robot, and its images: each take delivers the next messages."""
+
+    robot, is_online = "r1", True
+
+    def __init__(self, *turns) -> None:
+        self.callbacks, self._turns = {}, iter(turns)
+
+    def subscribe(self, channel, callback) -> None:
+        self.callbacks[channel] = callback
+
+    def take(self, seconds: float) -> None:
+        for turn in next(self._turns, ()):
+            if isinstance(turn, Message):
+                self.callbacks[turn.channel](turn)
+            else:
+                turn()
+        assert seconds > 0
+
+
+def status(number: int) -> Message:
+    return Message(STATUS, "", b'{"seq":%d}' % number, b"{}")
+
+
+@pytest.mark.parametrize("wanted", [FRAME, OVERLAY])
+def test_recording_has_each_message_of_its_time(tmp_path: Path, wanted) -> None:
+    path, messages = tmp_path / "run.mcap", [status(1), Message(FRAME, "", b"{}", NOISE), status(2)]
+    robot = Talking(messages[:1], messages[1:])
+    recorder = record(robot, robot, path, wanted, 0.05)
+    assert set(robot.callbacks) == {*RECORDED, wanted}
+    assert [one.message for one in read_recording(path)] == messages
+    assert read_about(path) == {"robot": "r1"} and recorder.counts == {"status": 2, "frame": 1}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_ended_recording_is_kept(tmp_path: Path, number: signal.Signals) -> None:
+    robot = Talking([status(1)], [status(2), lambda: signal.raise_signal(number)], [status(3)])
+    before = signal.getsignal(number)
+    record(robot, robot, tmp_path / "run.mcap", FRAME, 60.0)
+    assert [one.message for one in read_recording(tmp_path / "run.mcap")] == [status(1), status(2)]
+    assert signal.getsignal(number) is before
+
+
+def test_recording_without_a_message_is_an_error_and_leaves_no_file(monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("sightline.operator_side.recording.film.PATIENCE_S", 0.01)
+    with pytest.raises(LinkError, match=r"no image from robot 'r1' after 0\.01 s"):
+        record(Talking(), Talking(), tmp_path / "run.mcap", FRAME, 60.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_recording_has_its_length_from_the_first_message_on(tmp_path: Path) -> None:
+    robot = Talking([lambda: time.sleep(0.2)], [status(1), lambda: time.sleep(0.03)])
+    begin_s = time.monotonic()
+    recorder = record(robot, robot, tmp_path / "run.mcap", FRAME, 0.1)
+    assert recorder.counts == {"status": 1} and 0.3 < time.monotonic() - begin_s < 3
+
+
+def test_recording_on_a_full_disk_ends_with_one_line() -> None:
+    robot = Talking(*[[Message(FRAME, "", b"{}", bytes(200_000))]] * 100)
+    with pytest.raises(ConfigError, match="/dev/full ends early: No space left on device; free some space or name"):
+        record(robot, robot, Path("/dev/full"), FRAME, 60.0)
+
+
+@pytest.mark.parametrize("overlay", [False, True])
+@pytest.mark.parametrize("dropped", [0, 3])
+def test_capture_prints_what_it_recorded(monkeypatch, capsys, tmp_path: Path, overlay: bool, dropped: int) -> None:
+    """The images of the recorder are always frames: taken overlays would end its subscription to frames."""
+    file, robot, taken = tmp_path / "run.MCAP", Talking(), []
+    monkeypatch.setattr(watch, "open_link", lambda *_given, **_more: nullcontext(robot))
+    monkeypatch.setattr(watch, "Pictures", lambda _link, _role, first, _secure: taken.append(first) or robot)
+
+    def recorded(*given):
+        assert given == (robot, robot, file, OVERLAY if overlay else FRAME, 5.0)
+        return SimpleNamespace(counts={"status": 2, "frame": 1}, dropped=dropped)
+
+    monkeypatch.setattr("sightline.operator_side.recording.film.record", recorded)
+    command = ("capture", "r1", "--connect", "tcp/127.0.0.1:1", "--out", str(file), *["--overlay"] * overlay)
+    code, out, err = run(capsys, *command)
+    assert (code, out) == (0, f"{file}: 3 messages of r1: frame 1, status 2\n") and taken == [FRAME]
+    assert err == (f"capture: 3 messages are missing, because {file} is on a slow disk\n" if dropped else "")
+    assert json.loads(run(capsys, *command, "--json")[1]) == {
+        "robot": "r1", "file": str(file), "messages": {"status": 2, "frame": 1}, "dropped": dropped,
+        "complete": not dropped,
+    }
