@@ -12,6 +12,8 @@ from sightline.protocol.messages import STILL, CameraModel, Twist
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.missions.port import Plan, View
 
+_FURTHEST_PX = 1e6  # as on the wire; a box of a plug-in may be anywhere
+
 
 @dataclass(frozen=True, slots=True)
 class Blob:
@@ -32,9 +34,9 @@ def largest(view: View) -> Blob | None:
 def _blob(one: Detection) -> Blob:
     if one.circle is not None:
         radius = one.circle.radius_px
-        return Blob(one, one.circle.cx_px, radius, math.pi * radius * radius)
+        return Blob(one, _bounded(one.circle.cx_px, _FURTHEST_PX), radius, math.pi * radius * radius)
     width, height = one.x2_px - one.x1_px, one.y2_px - one.y1_px
-    return Blob(one, one.center_px[0], max(width, height) / 2, width * height)
+    return Blob(one, _bounded(one.center_px[0], _FURTHEST_PX), max(width, height) / 2, width * height)
 
 
 # Band steering, a baseline: one of three fixed twists, by the position and size of the target in the image. Pure.
@@ -192,11 +194,11 @@ class PixelPi:
         angular = 0.0 if steady else correction + config.integral_share * self._sum_rad_s
         near = config.stop_area_px is not None and blob.area_px >= config.stop_area_px
         linear = 0.0 if near else _bounded(config.area_mps / blob.area_px, config.max_linear_mps)
-        twist = Twist(linear_mps=linear, angular_rad_s=_bounded(angular, _SANITY))
+        twist = Twist(linear_mps=_bounded(linear, _SANITY), angular_rad_s=_bounded(angular, _SANITY))
         return Plan(twist, "straight" if steady else "turning", target=blob.detection)
 
 
-_SANITY = 100.0  # rad/s: an integral that grew for an hour still fits on the wire
+_SANITY = 100.0  # m/s, rad/s: an integral that grew for an hour, or a box of almost no area, still fits on the wire
 
 
 def _bounded(value: float, limit: float | None) -> float:

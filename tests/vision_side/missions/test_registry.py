@@ -7,6 +7,8 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from sightline.protocol.config import Config as Settings
@@ -222,6 +224,21 @@ def test_pixel_p_decides_five_times_a_second():
     turns = [twist_of(law, view(ball(160 + at, 30), t_us=10_000_000 + at * 33_333))[1] for at in range(12)]
     assert [round(turn / -0.009) for turn in turns] == [0] * 7 + [7] * 5
     assert twist_of(law, view(t_us=12_000_000)) == (0.0, 0.0)
+
+
+FAR = st.floats(allow_nan=False, allow_infinity=False)
+SIZE = st.floats(min_value=0, exclude_min=True, allow_infinity=False)
+
+
+@example(box=(1e308, 0.0, 1.7e308, 1e308), circle=None, size=1.0)
+@example(box=(1e-320, 0.0, 2e-320, 1.0), circle=None, size=1.0)
+@example(box=(0.0, 0.0, 1.0, 1.0), circle=1e308, size=1e308)
+@given(box=st.tuples(FAR, FAR, FAR, FAR), circle=st.none() | FAR, size=SIZE)
+def test_legacy_controllers_give_a_twist_for_any_box(box, circle, size):
+    one = Detection(*box, 0.9, "ball", circle and Circle(circle, 0.0, size))
+    for kind in ("band", "pixel-p", "pixel-pi"):
+        law = mission(kind, **({"min_area_px": 0} if kind == "pixel-pi" else {}))
+        assert all(abs(speed) < 1e9 for _ in range(2) for speed in twist_of(law, view(one)))
 
 
 # --- the page --------------------------------------------------------------------------------------------------------
