@@ -1,9 +1,9 @@
 """Writes the messages of a link to MCAP and reads them back. Shell (threads, files).
 
 Each Sightline channel (with its source: `twist/vision`) is one MCAP channel of JSON messages with a schema, which other
-tools show (`foxglove`). Invalid messages, and all messages of older recordings, have the encoding `sightline.v1`: header
-length (uint16, big-endian), header and payload. Both are read back exactly as received. `log_time` is the time of
-arrival; the header has the robot's time. It never goes back, because the wall clock is read once. A file that a kill
+tools show (`foxglove`). Invalid messages, and all messages of older recordings, have the encoding `sightline.v1`:
+header length (uint16, big-endian), header and payload. Both are read back exactly as received. `log_time` is the time
+of arrival; the header has the robot's time. It never goes back, because the wall clock is read once. A file that a kill
 truncated is readable here up to the cut; for other tools, `mcap recover` writes its index.
 """
 

@@ -84,8 +84,8 @@ class _Object:
         self._unlike_us = 0
         """Time since its last sighting with this look."""
         self.was_beside = False
-        """True after it was seen together with the target again, in a slow stream once. A sighting that fits it better is
-        not of the target."""
+        """True after it was seen beside the target again, in a slow stream once. A sighting that fits it better is not
+        of the target."""
 
     def advance(self, dt_s: float) -> None:
         """Predict with constant velocity and white acceleration."""

@@ -46,6 +46,7 @@ def ends(tmp_path):
     waited, aside = (socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(2))
     child = DriverEnd(RobotConfig(state_dir=tmp_path), "0a0a0a0a")
     child.socket, child._aside = waited[0], aside[0]
+    child.on_ready()
     for end in (waited[0], aside[0]):
         end.setblocking(False)
     yield child, NetworkEnd(waited[1], aside[1])
