@@ -13,11 +13,15 @@ from pathlib import Path
 import av
 import cv2
 import pytest
+from mcap.reader import make_reader
 
 from sightline.operator_side.cli.app import run
 from sightline.operator_side.client.pictures import Shot
 from sightline.operator_side.recording.film import Film, film
+from sightline.operator_side.recording.recorder import read_recording
 from sightline.protocol.channels import FRAME
+from sightline.protocol.codec import decode
+from sightline.protocol.messages import FrameHeader
 from tests.e2e.javascript.test_browser import LEVELS, Started
 from tests.fixtures.javascript import Browser, chromium
 from tests.fixtures.links import START_S, until
@@ -147,6 +151,20 @@ def test_video_lasts_as_long_as_wanted_by_the_capture_times(tmp_path: Path) -> N
 
     captured = film(Played(), tmp_path / "run.mp4", FRAME, 1.0)
     assert (captured.frames, captured.seconds) == (11, 1.0)
+
+
+@pytest.mark.parametrize(("end", "more"), [("zenoh", {"twist/vision"}), ("web", set())])
+def test_recording_has_what_the_link_delivers(site: Site, tmp_path: Path, end: str, more: set[str]) -> None:
+    file = tmp_path / "run.mcap"
+    where = ["--connect", site.at(end), "--seconds", "2", "--out", str(file), "--overlay"]
+    assert run(["capture", "r1", *where]) == 0
+    with file.open("rb") as opened:
+        schemas = {channel.topic: schema.name for schema, channel, _ in make_reader(opened).iter_messages()}
+    topics = {"frame", "status", "camera", "transform", "overlay/vision"} | more
+    assert topics <= set(schemas) and schemas["frame"] == schemas["overlay/vision"] == "foxglove.CompressedImage"
+    times_us = [decode(FrameHeader, one.message.header).t_us for one in read_recording(file)
+                if one.message.channel is FRAME]
+    assert 1.0 < (times_us[-1] - times_us[0]) / 1e6 < 4.0 and len(times_us) > 10
 
 
 def test_video_that_ends_early_is_complete(site: Site, tmp_path: Path) -> None:
