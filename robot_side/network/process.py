@@ -20,7 +20,7 @@ from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import HardwareError, SightlineError, WireError
-from sightline.protocol.log import RepeatLimiter, count_fault, error_line, error_text, faults, report_fault, start_log
+from sightline.protocol.log import RepeatLimiter, count_fault, error_line, fault_text, faults, report_fault, start_log
 from sightline.protocol.messages import CameraModel
 from sightline.protocol.transports.flood_limits import limit_floods
 from sightline.protocol.transports.link import Link, Message
@@ -193,13 +193,13 @@ class NetworkProcess:
         return picture
 
     def _on_camera_error(self, error: BaseException) -> None:
-        text = error_text(error)
+        text = fault_text("camera", error)
         if text in self._setup.camera_fault:  # an earlier process has logged it
             count_fault("camera")
         else:
             report_fault("camera", error)
         if not self._camera_fault:
-            _log.warning("camera: %s", text)
+            _log.warning("camera: %s", text.removeprefix("camera raised "))
         self._camera_fault = text
         time.sleep(_CAMERA_RETRY_S)
 

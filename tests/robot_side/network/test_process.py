@@ -197,16 +197,19 @@ def test_each_use_of_the_credit_holds_the_lock(process, act, names):
     assert not process._lock.locked(), "and gives it back"
 
 
+TYPE, VALUE = "camera raised TypeError: ", "camera raised ValueError: "
+
+
 @pytest.mark.parametrize(("change", "fault"), [
-    ({"read": lambda _: b"jpeg"}, "read() returned bytes; expected Picture or None"),
-    ({"read": lambda _: Picture(memoryview(b"jpeg"), 1)}, "Picture.jpeg is memoryview; expected bytes | bytearray"),
-    ({"read": lambda _: Picture("jpeg", 1)}, "Picture.jpeg is str; expected bytes | bytearray"),
-    ({"read": lambda _: Picture(b"jpeg", 1.5)}, "Picture.t_us is float; expected int"),
-    ({"read": lambda _: Picture(b"jpeg", 1, 0)}, "Picture.scale_percent is 0; expected 1 to 100"),
-    ({"read": lambda _: Picture(b"jpeg", 1, 50.0)}, "Picture.scale_percent is float; expected int"),
-    ({"model": None}, "model is NoneType; expected CameraModel"),
-    ({"model": {"width_px": 320}}, "model is dict; expected CameraModel"),
-    ({"read": lambda _: Picture(b"jpeg", True)}, "Picture.t_us is bool; expected int"),
+    ({"read": lambda _: b"jpeg"}, TYPE + "read() returned bytes; expected Picture or None"),
+    ({"read": lambda _: Picture(memoryview(b"jpeg"), 1)}, TYPE + "Picture.jpeg is memoryview; expected bytes | bytearray"),
+    ({"read": lambda _: Picture("jpeg", 1)}, TYPE + "Picture.jpeg is str; expected bytes | bytearray"),
+    ({"read": lambda _: Picture(b"jpeg", 1.5)}, TYPE + "Picture.t_us is float; expected int"),
+    ({"read": lambda _: Picture(b"jpeg", 1, 0)}, VALUE + "Picture.scale_percent is 0; expected 1 to 100"),
+    ({"read": lambda _: Picture(b"jpeg", 1, 50.0)}, TYPE + "Picture.scale_percent is float; expected int"),
+    ({"model": None}, TYPE + "model is NoneType; expected CameraModel"),
+    ({"model": {"width_px": 320}}, TYPE + "model is dict; expected CameraModel"),
+    ({"read": lambda _: Picture(b"jpeg", True)}, TYPE + "Picture.t_us is bool; expected int"),
     ({"read": lambda _: Picture(b"jpeg" * 200_000, 1)}, "image of 800000 bytes; at most 400000 (max_frame_bytes)"),
     ({"read": lambda _: Picture(b"jpeg", -1)}, "the time of the image is not after that of the one before"),
 ])
