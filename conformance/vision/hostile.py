@@ -229,6 +229,7 @@ REJECTED: Final[dict[str, tuple[str, Callable[[], bytes]]]] = {
     "V-LIM-15": ("An empty payload", lambda: b""),
     "V-LIM-16": ("A text", lambda: b"0.5000|0.0000"),
     "V-LIM-17": ("A JPEG that claims the right size and has no pixels", lambda: claiming(320, 240)),
+    "V-LIM-20": ("A JPEG with a segment of length zero", lambda: b"\xff\xd8\xff\xfe\x00\x00" + picture("left")[2:]),
     "V-LIM-19": ("A picture of another size than the camera's", lambda: picture("left_half")),
     "V-LIM-18": ("A JPEG of zeros after its start", lambda: b"\xff\xd8" + bytes(4_000)),
 }
