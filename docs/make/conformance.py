@@ -57,7 +57,7 @@ can lie about all of them. The kit does not see:
 - **What a vision service follows.** The cases about the axes use a yellow ball. They are not applicable to a service
   whose twists do not depend on it (V-STEER-10).
 - **A STOP that is forgotten over a restart** (6.3, 6.5): the kit restarts no robot.
-- **An ack with a payload**, and on WebSocket an ack whose header names another source than its key.
+- **A robot that takes an ack with a payload**, or on WebSocket one whose header names another source than its key.
 - **The power supply, the emergency stop and the hardware watchdog.**"""
 
 LISTED_ELSEWHERE = ("codec",)
