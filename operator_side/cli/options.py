@@ -2,9 +2,10 @@
 
 import json
 import math
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext, redirect_stdout
+from contextlib import contextmanager, redirect_stdout
 from typing import Annotated, Any, Final, TypeVar
 
 import typer
@@ -86,9 +87,22 @@ Number = TypeVar("Number", int, float)
 
 @contextmanager
 def plugin_prints(as_json: bool) -> Iterator[None]:
-    """With `--json`, redirect the output of plug-ins to stderr, so that stdout contains only the result."""
-    with redirect_stdout(sys.stderr) if as_json else nullcontext():
+    """With `--json`, redirect the output of plug-ins and their C code to stderr: stdout contains only the result."""
+    if not as_json:
         yield
+        return
+    import ctypes
+
+    sys.stdout.flush()
+    stdout = os.dup(1)
+    try:
+        os.dup2(2, 1)
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        ctypes.CDLL(None).fflush(None)  # C keeps in its buffer what it prints to a pipe
+        os.dup2(stdout, 1)
+        os.close(stdout)
 
 
 def print_result(result: dict[str, Any], lines: Iterable[str], as_json: bool) -> int:

@@ -1,6 +1,7 @@
 """The command line: help, one line and an exit code for each error, and no heavy import before it is needed."""
 
 import ast
+import ctypes
 import errno
 import importlib.metadata
 import io
@@ -11,7 +12,7 @@ import re
 import subprocess
 import sys
 import tomllib
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import asdict
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from sightline.evaluation.checks import at_most
 from sightline.operator_side.cli import app as cli
 from sightline.operator_side.cli import commands as table
 from sightline.operator_side.cli import operate
-from sightline.operator_side.cli.options import CHECK_FAILED, print_result
+from sightline.operator_side.cli.options import CHECK_FAILED, plugin_prints, print_result
 from sightline.operator_side.preflight import needs
 from sightline.protocol.errors import CheckError, ConfigError, HardwareError, LinkError, SightlineError
 from tests.fixtures.commands import run
@@ -454,6 +455,22 @@ def test_completion_in_a_home_that_cannot_be_written_is_one_line(tmp_path, home)
     done = subprocess.run([*command, "bash"], capture_output=True, text=True, env=environ, check=False)
     assert done.returncode == 2
     assert re.fullmatch(rf"error: cannot write {tmp_path / home}.*: .*; set HOME to a folder .*\n", done.stderr)
+
+
+@pytest.mark.parametrize("as_json", [True, False])
+@pytest.mark.parametrize("fails", [True, False])
+def test_what_the_c_code_of_a_plug_in_prints_is_not_in_the_json(capfd, as_json, fails):
+    libc = ctypes.CDLL(None)
+    with suppress(ZeroDivisionError), plugin_prints(as_json):
+        print("python")
+        libc.puts(b"C")
+        os.write(1, b"system\n")
+        assert not fails or 1 / 0
+    print("{}", flush=True)
+    libc.fflush(None)
+    out, err = capfd.readouterr()
+    meant, other = (err, out) if as_json else (out, err)
+    assert {"python", "C", "system"} <= set(meant.split()) and other == ("{}\n" if as_json else "")
 
 
 @pytest.mark.parametrize("number", [math.inf, -math.inf, math.nan])
