@@ -23,6 +23,7 @@ from sightline.operator_side.cli.options import (
     check_camera_sets,
     command_group,
     first_given,
+    plugin_prints,
     print_result,
 )
 from sightline.operator_side.client.pictures import viewer_role
@@ -279,10 +280,11 @@ def doctor(
     if peer is not None:
         check_endpoint(peer)
     found: list[Finding] = []
-    for finding in _findings(robot, peer, camera, camera_sets or [], secure):
-        found.append(finding)
-        if not as_json:
-            typer.echo(finding.line)
+    with plugin_prints(as_json):
+        for finding in _findings(robot, peer, camera, camera_sets or [], secure):
+            found.append(finding)
+            if not as_json:
+                typer.echo(finding.line)
     bad = sum(one.ok is False for one in found)
     last = f"{bad or 'no'} problem{'s' if bad > 1 else ''} in {len(found)} checks"
     return print_result(as_object(found), [last], as_json)

@@ -76,11 +76,14 @@ def demo(
         _check_story(DemoOptions(scenario, seconds or 0.0, seed, latency_ms, loss, out, transport, mission, detector))
         return _make_story(out, seed, show, as_json=as_json, open_it=open_it)
     lasting_s = _seconds(scenario, seconds)
-    run = run_demo(DemoOptions(scenario, lasting_s, seed, latency_ms, loss, out, transport, mission, detector), show)
-    show("all three processes ended; scoring, replaying and filming the run")
-    scored = report(run)
+    options = DemoOptions(scenario, lasting_s, seed, latency_ms, loss, out, transport, mission, detector)
+    with plugin_prints(as_json):
+        run = run_demo(options, show)
+        show("all three processes ended; scoring, replaying and filming the run")
+        scored = report(run)
     code = print_result(scored.to_dict(), summary(scored), as_json)
-    write_files(scored)  # after the results are printed, because a full disk must not lose them
+    with plugin_prints(as_json):
+        write_files(scored)  # after the results are printed, because a full disk must not lose them
     if open_it:
         webbrowser.open((scored.run.folder / "run.mp4").as_uri())
     return code
@@ -168,10 +171,10 @@ def score(
     )
     if sabotage:
         wanted = sabotaged(wanted, sabotages_named(sabotage))
-        with progress_bar(len(wanted)) as advance:
+        with plugin_prints(as_json), progress_bar(len(wanted)) as advance:
             noticed = run_all_sabotaged(wanted, jobs or os.cpu_count() or 1, lambda _case: advance())
         return print_result(noticed.to_dict(), noticed.lines(), as_json)
-    with progress_bar(len(wanted)) as advance:
+    with plugin_prints(as_json), progress_bar(len(wanted)) as advance:
         report = run_cases(wanted, jobs or os.cpu_count() or 1, lambda _case: advance())
     return print_result(report.to_dict(), [score_text(report)], as_json)
 

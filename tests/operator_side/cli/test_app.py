@@ -15,6 +15,7 @@ import tomllib
 from contextlib import nullcontext, suppress
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import typer
@@ -471,6 +472,25 @@ def test_what_the_c_code_of_a_plug_in_prints_is_not_in_the_json(capfd, as_json, 
     out, err = capfd.readouterr()
     meant, other = (err, out) if as_json else (out, err)
     assert {"python", "C", "system"} <= set(meant.split()) and other == ("{}\n" if as_json else "")
+
+
+@pytest.mark.parametrize(("arguments", "used"), [
+    (["doctor"], ["operator_side.cli.admin._findings"]),
+    (["score", "--scenario", "static"], ["evaluation.score.runs.run_cases"]),
+    (["score", "--scenario", "static", "--sabotage", "wheels-dead"], ["evaluation.score.runs.run_all_sabotaged"]),
+    (["demo"], ["evaluation.demo.run.run_demo", "evaluation.demo.report.report", "evaluation.demo.report.write_files"]),
+])  # fmt: skip
+def test_json_of_a_command_that_runs_a_plug_in_has_its_prints_on_stderr(capsys, monkeypatch, arguments, used):
+    def prints(*_given):
+        print("plug-in")
+        return [] if arguments == ["doctor"] else SimpleNamespace(to_dict=lambda: {"ok": True}, lines=list)
+
+    for name in used:
+        monkeypatch.setattr(f"sightline.{name}", prints)
+    for text in ("demo.report.summary", "score.runs.score_text"):
+        monkeypatch.setattr(f"sightline.evaluation.{text}", lambda _result: "")
+    code, out, err = run(capsys, *arguments, "--json")
+    assert code == 0 and json.loads(out)["ok"] and err.count("plug-in") == len(used)
 
 
 @pytest.mark.parametrize("number", [math.inf, -math.inf, math.nan])
