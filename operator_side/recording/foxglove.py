@@ -1,9 +1,9 @@
 """Writes messages as JSON with schemas that Foxglove and Lichtblick show, and reads them back byte for byte. Pure.
 
-A message is `{"header": HEADER, "data": PAYLOAD, ...}`. Header and JSON payload stay as they came; a twist is text, and
-any other payload base64. The further fields are those of the schema: a JPEG is a foxglove.CompressedImage, a scan a
-foxglove.LaserScan, the camera model a foxglove.CameraCalibration. The topic `transform` has the pose of the robot and
-the mounting of its camera as foxglove.FrameTransform.
+A message is `{"message_header": HEADER, "data": PAYLOAD, ...}`. Header and JSON payload stay as they came; a twist is
+text, and any other payload base64. The further fields are those of the schema: a JPEG is a foxglove.CompressedImage, a
+scan a foxglove.LaserScan, the camera model a foxglove.CameraCalibration. The topic `transform` has the pose of the
+robot and the mounting of its camera as foxglove.FrameTransform.
 
 Source: docs.foxglove.dev, message schemas; JSON in MCAP files.
 """
@@ -26,7 +26,8 @@ SCHEMA_ENCODING: Final = "jsonschema"
 TRANSFORM: Final = "transform"
 """Topic of the poses, and the name of its schema."""
 _ODOMETRY, _BASE, _CAMERA = "odometry", "base", "camera"
-_HEADER, _DATA = '{"header":', '"data":'
+# Viewers take a message with a field `header` for one of ROS.
+_HEADER, _DATA = '{"message_header":', '"data":'
 _Fields = dict[str, Any]
 
 
@@ -45,7 +46,7 @@ def shown(message: Message, log_time_ns: int) -> bytes:
         if channel.payload is None:
             payload = json.dumps(_text(channel, payload)).encode()
         data = b'"data":%b%b}' % (payload, (more[1:-1] and "," + more[1:-1]).encode())
-        data = b'{"header":%b,%b' % (message.header, data) if message.header else b"{" + data
+        data = b"%b%b,%b" % (_HEADER.encode(), message.header, data) if message.header else b"{" + data
         # Valid JSON has no Infinity; readers take a number beyond their range for it.
         data = data.replace(b"Infinity", b"1e999") if channel is SCAN else data
         if received(channel, message.source, data) == message:
@@ -193,7 +194,7 @@ def schema_of(channel: Channel | None) -> tuple[str, bytes]:
     else:
         image = ("foxglove.CompressedImage", _IMAGE) if channel.encoding == JPEG else (f"sightline.{channel.name}", {})
         name, more = _WELL_KNOWN.get(channel, image)
-        schema = _object({"header": _model(channel.header), "data": _payload(channel), **more})
+        schema = _object({"message_header": _model(channel.header), "data": _payload(channel), **more})
     return name, json.dumps({"title": name, **schema}).encode()
 
 

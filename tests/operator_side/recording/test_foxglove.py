@@ -101,9 +101,10 @@ def kinds(schema: dict) -> set[str]:
 def test_schema_has_only_what_viewers_read(channel):
     name, data = foxglove.schema_of(channel)
     schema = json.loads(data)
+    assert "header" not in schema["properties"], "which makes it a message of ROS"
     assert schema["title"] == name and {"object", "number", "integer"} & kinds(schema)
     if channel is not None:
-        assert set(schema["properties"]["header"]["properties"]) == set(channel.header.model_fields)
+        assert set(schema["properties"]["message_header"]["properties"]) == set(channel.header.model_fields)
         kind = {STATUS: "object", TWIST: "string"}.get(channel)
         assert kind in (None, schema["properties"]["data"]["type"])
 
@@ -128,7 +129,7 @@ def test_frame_is_an_image_and_a_pose(tmp_path_factory, jpeg, pose):
     read = shown(tmp_path_factory.mktemp("frame") / "run.mcap", Message(FRAME, "", header, jpeg))
     image, moved = read["foxglove.CompressedImage"], read["foxglove.FrameTransform"]
     assert base64.b64decode(image["data"]) == jpeg
-    assert (image["format"], image["frame_id"], image["header"]["pose"]) == ("jpeg", "camera", list(pose))
+    assert (image["format"], image["frame_id"], image["message_header"]["pose"]) == ("jpeg", "camera", list(pose))
     assert (moved["parent_frame_id"], moved["child_frame_id"]) == ("odometry", "base")
     assert moved["translation"] == {"x": pose[0], "y": pose[1], "z": 0.0}
     ahead = rotated(moved["rotation"], (1.0, 0.0, 0.0))
@@ -188,7 +189,7 @@ def test_twist_has_its_numbers_also_without_a_header(path):
     for header in (b"", b'{"v":1}'):
         read = shown(path, Message(TWIST, "guest", header, b"0.2000|-0.3500"))["sightline.twist"]
         assert (read["linear_mps"], read["angular_rad_s"], read["data"]) == (0.2, -0.35, "0.2000|-0.3500")
-        assert read.get("header") == (json.loads(header) if header else None)
+        assert read.get("message_header") == (json.loads(header) if header else None)
 
 
 SCAN_HEADER = encode(ScanHeader(**STAMP, angle_min_rad=0.0, angle_increment_rad=0.1, range_min_m=0.1, range_max_m=8.0))
