@@ -1,4 +1,4 @@
-"""Differential drive: twist <-> wheel speeds, saturation that preserves the curve, odometry. Pure."""
+"""Differential drive: twist <-> wheel speeds, saturation that preserves the curve, odometry, doubtful encoders. Pure."""
 
 import math
 from typing import Annotated
@@ -91,3 +91,76 @@ class Odometer:
         left, right = (wheels.left_rad - start.left_rad) / seconds, (wheels.right_rad - start.right_rad) / seconds
         self._moving = twist_of(self._drive, left, right)
         self._rate_from = wheels
+
+
+_COMPARED_US = 2_000_000
+"""After this time and a turn in one direction a wheel is compared: its motor lags, and an encoder may be slow."""
+_LEAST_SHARE = 0.1
+_SIDES = "left", "right"
+_AT_ONCE_US, _STEP_RAD = 100_000, 0.5
+"""A drive may return a reading of up to 100 ms before with a new time; a coarse encoder has a dozen steps a turn."""
+
+
+class WheelMonitor:
+    """Compares the encoder of one wheel with its commanded speed."""
+
+    def __init__(self, max_rad_s: float) -> None:
+        """Begin. `max_rad_s`: highest commanded speed. Pushed or downhill, a wheel may be twice as fast."""
+        self._max_rad_s = 2 * max_rad_s
+        self._last: tuple[float, int] | None = None
+        self._from_rad = self._commanded_rad = 0.0
+        self._since_us = 0
+
+    def look(self, commanded_rad: float, angle_rad: float, t_us: int, now_us: int) -> str:
+        """Return what is doubtful, or "".
+
+        Args:
+            commanded_rad: commanded since the last call, rad.
+            angle_rad: angle of the encoder, rad.
+            t_us: time of this reading.
+            now_us: time on the robot's clock.
+        """
+        last_rad, last_us = self._last or (angle_rad, t_us)
+        self._last = (angle_rad, t_us) if t_us > last_us or self._last is None else self._last
+        step_rad, step_us = abs(self._last[0] - last_rad), max(self._last[1] - last_us, _AT_ONCE_US)
+        self._commanded_rad += commanded_rad
+        jumped = step_rad > self._max_rad_s * step_us / 1e6 + _STEP_RAD
+        doubt = f"jumped by {step_rad:.3g} rad; look for a loose wire, or a counter that wraps" if jumped else ""
+        if not doubt and now_us - self._since_us >= _COMPARED_US and abs(self._commanded_rad) >= math.tau:
+            doubt = self._compared(self._last[0] - self._from_rad)
+        elif not doubt and commanded_rad * self._commanded_rad > 0:
+            return ""
+        self._since_us, self._from_rad, self._commanded_rad = now_us, self._last[0], 0.0
+        return doubt
+
+    def _compared(self, turned_rad: float) -> str:
+        share = turned_rad / self._commanded_rad
+        if share >= _LEAST_SHARE:
+            return ""
+        fix = "are the wires of motor or encoder swapped?" if share <= -_LEAST_SHARE else (
+            "is it blocked, its motor or encoder loose, or the speed too low for it?")
+        return f"turned {turned_rad:.3g} rad where {self._commanded_rad:.3g} rad were commanded; {fix}"
+
+
+class EncoderMonitor:
+    """Names a wheel whose encoder jumps, stands still while it is commanded, or runs backwards."""
+
+    def __init__(self, drive: DiffDriveConfig) -> None:
+        self._monitors = WheelMonitor(drive.max_wheel_rad_s), WheelMonitor(drive.max_wheel_rad_s)
+        self._looked_us: int | None = None
+
+    def look(self, speeds: tuple[float, float], wheels: WheelAngles, now_us: int) -> str:
+        """Return what is doubtful, with the side, or "".
+
+        Args:
+            speeds: (left, right) commanded since the last call, rad/s.
+            wheels: newest reading; finite.
+            now_us: time on the robot's clock.
+        """
+        seconds = 0.0 if self._looked_us is None else (now_us - self._looked_us) / 1e6
+        self._looked_us = now_us
+        angles = wheels.left_rad, wheels.right_rad
+        doubts = [f"{side} wheel {doubt}"
+                  for side, monitor, speed, angle_rad in zip(_SIDES, self._monitors, speeds, angles, strict=True)
+                  if (doubt := monitor.look(speed * seconds, angle_rad, wheels.t_us, now_us))]
+        return "; ".join(doubts)

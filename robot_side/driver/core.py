@@ -27,7 +27,7 @@ from sightline.protocol.messages import (
 from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import Message
 from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.kinematics import Odometer, wheel_speeds
+from sightline.robot_side.kinematics import EncoderMonitor, Odometer, wheel_speeds
 from sightline.robot_side.pipe import CommandAck, RobotMotion
 from sightline.robot_side.ports import Ranges, WheelAngles
 from sightline.robot_side.safety.battery import BatteryMonitor
@@ -69,6 +69,10 @@ class DriverCore:
             needs_proof=bool(config.secure),
         )
         self.odometer = Odometer(config.wheels)
+        self._encoders = EncoderMonitor(config.wheels)
+        self._speeds = (0.0, 0.0)
+        self.doubtful_wheel = ""
+        """What the encoders contradict since the last tick, or empty."""
         self.stream = StreamStatus()
         self.tick_late_max_us = 0
         self.network_restarts = 0
@@ -153,10 +157,12 @@ class DriverCore:
             if (ahead_us := wheels.t_us - now_us) > _AHEAD_US:
                 raise ValueError(f"WheelAngles.t_us is {ahead_us / 1e6:.3g} s ahead; take the robot's clock")
             self.odometer.update(wheels)
+        self.doubtful_wheel = self._encoders.look(self._speeds, wheels, now_us) if wheels is not None else ""
         if scan is not None:
             self._on_scan(scan, now_us)
         decision = self.gate.step(now_us)
-        return wheel_speeds(self.config.wheels, decision.twist)
+        self._speeds = wheel_speeds(self.config.wheels, decision.twist)
+        return self._speeds
 
     def motion(self) -> RobotMotion:
         """Return the current motion of the robot, for frame headers."""

@@ -23,6 +23,7 @@ from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import HardwareError, RejectReason, SightlineError, WireError
 from sightline.protocol.log import (
     RepeatLimiter,
+    count_fault,
     fault_text,
     faults,
     report_ending,
@@ -363,6 +364,7 @@ class Driver:
         self.latch_writer.want(self._driver_core.gate.state is State.STOPPED)
         self._log_state(self._driver_core.gate.state, self._driver_core.gate.reason)
         self._log_battery(now_us)
+        self._log_wheel(now_us)
         self._report_stop(now_us)
 
     def _answer(self) -> None:
@@ -450,6 +452,13 @@ class Driver:
         if level is not logged:
             volts = battery.volts(now_us)
             self._log(f"battery {level.value}" + (f" ({volts:.2f} V)" if volts is not None else ""))
+
+    def _log_wheel(self, now_us: int) -> None:
+        """Count what the encoders contradict, and log it at once, then ever more rarely."""
+        if doubt := self._driver_core.doubtful_wheel:
+            count_fault("encoder")
+            if self._rejection_limiter.due("encoder", now_us):
+                _log.warning("robot %s: %s", self._driver_core.config.robot, doubt)
 
     def _log(self, line: str) -> None:
         _log.info("robot %s: %s", self._driver_core.config.robot, line)

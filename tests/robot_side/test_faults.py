@@ -1,6 +1,7 @@
 """Faults are visible: each exception is logged once with its traceback, counted, and shown in `status`."""
 
 import errno
+import itertools
 import threading
 import time
 
@@ -19,6 +20,7 @@ from sightline.robot_side.driver.persistence import StopLatch
 from sightline.robot_side.network import process as network_process
 from sightline.robot_side.network.process import NetworkProcess
 from sightline.robot_side.pipe import CAMERA_EXIT, DriverEnd, NetworkSetup
+from sightline.robot_side.ports import WheelAngles
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess, Vision
 from tests.robot_side.driver.test_process_faults import BrokenDrive, driver  # noqa: F401  a fixture
@@ -89,6 +91,19 @@ def test_exceptions_of_drive_and_range_sensor_are_in_the_status(driver, caplog, 
     shown = [one for one in caplog.records if one.levelname == "ERROR"]
     assert [one.message for one in shown] == ["drive raised RuntimeError: no such motor",
                                               "range sensor raised OSError: no such sensor"]
+
+
+def test_a_doubtful_encoder_is_counted_each_time_and_logged_ever_more_rarely(driver, caplog, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(driver.driver_end, "keep_alive", lambda *_: None)
+    times = itertools.count()
+    readings = [WheelAngles(0.0, 1000.0 * (turn % 2), 20_000 * turn) for turn in range(5)]
+    monkeypatch.setattr(driver._drive, "wheels", lambda: readings[next(times) % 5])
+    for turn in range(4):
+        driver._tick(20_000 * turn)
+    status = status_of(driver)
+    assert status.faults == {"encoder": 3} and status.state != "FAULT"
+    lines = [one.message for one in caplog.records if one.levelname == "WARNING"]
+    assert lines == 2 * ["robot r1: right wheel jumped by 1e+03 rad; look for a loose wire, or a counter that wraps"]
 
 
 class UnprintableError(RuntimeError):

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from sightline.protocol.messages import Twist
-from sightline.robot_side.kinematics import DiffDriveConfig, Odometer, twist_of, wheel_speeds
+from sightline.robot_side.kinematics import DiffDriveConfig, EncoderMonitor, Odometer, twist_of, wheel_speeds
 from sightline.robot_side.ports import WheelAngles
 
 DRIVE = DiffDriveConfig()
@@ -205,3 +205,97 @@ def test_the_next_rate_is_taken_from_where_the_last_ended():
     reckoned.update(WheelAngles(9.0, 9.0, 120_000))
     assert reckoned.moving == pytest.approx((3.75, 5.0), rel=1e-12), "20 ms are too short"
     assert odometer((0.0, 0.0, 0), (1.0, 1.0, 50_000), (1.0, 1.0, 100_000)).moving == (0.0, 0.0)
+
+
+# --- encoders that contradict the commands -----------------------------------------------------------------------
+
+
+def doubts_of(speed_of, angle_of, drive=DRIVE, seconds=12.0, read_s=0.02, own_time=True, side=0):
+    """All that the monitor finds at 50 Hz; `angle_of` maps the true angle and the time to that of the encoder."""
+    monitor, true, speed, found, reading = EncoderMonitor(drive), [0.0, 0.0], 0.0, [], None
+    for now_us in range(0, round(seconds * 1e6), 20_000):
+        for wheel in (0, 1):
+            true[wheel] += speed * 0.02
+        if reading is None or now_us >= reading[1] + read_s * 1e6:
+            angles = true[:]
+            angles[side] = angle_of(true[side], now_us / 1e6)
+            reading = angles, now_us
+        wheels = WheelAngles(*reading[0], reading[1] if own_time else now_us)
+        found += [(now_us / 1e6, doubt) for doubt in [monitor.look((speed, speed), wheels, now_us)] if doubt]
+        speed = speed_of(now_us / 1e6)
+    return found
+
+
+SPEEDS = [0.3, 2.0, 8.0, 14.0, 22.0, -0.3, -14.0, -22.0]
+
+
+@pytest.mark.parametrize("speed", SPEEDS)
+@pytest.mark.parametrize("steps", [12, 360, 4096])
+@pytest.mark.parametrize(("read_s", "own_time"), [(0.02, True), (0.1, True), (0.1, False), (1.0, True)])
+def test_encoders_that_are_coarse_or_slow_are_not_doubted(speed, steps, read_s, own_time):
+    step_rad = math.tau / steps
+    assert not doubts_of(lambda _: speed, lambda true, _: true // step_rad * step_rad, read_s=read_s, own_time=own_time)
+
+
+@pytest.mark.parametrize("speed", SPEEDS)
+@pytest.mark.parametrize("lag_s", [0.05, 0.2, 0.3])
+def test_motors_that_lag_and_change_direction_are_not_doubted(speed, lag_s):
+    turned = []
+
+    def lags(true, _):
+        turned.append(true)
+        return turned[max(0, len(turned) - 1 - round(lag_s / 0.02))]
+
+    for period_s in (1.0, 3.0, 60.0):
+        turned.clear()
+        assert not doubts_of(lambda at_s, half_s=period_s / 2: speed * (-1) ** (at_s // half_s), lags)
+
+
+@pytest.mark.parametrize("factor", [0.2, 0.5, 1.8])
+def test_wheel_that_slips_or_has_a_wrong_radius_is_not_doubted(factor):
+    for speed in SPEEDS:
+        assert not doubts_of(lambda _, speed=speed: speed, lambda true, _: factor * true)
+
+
+@pytest.mark.parametrize("side", [0, 1])
+@pytest.mark.parametrize(("factor", "words"), [
+    (0.0, "is it blocked"), (0.05, "is it blocked"), (-0.05, "is it blocked"), (-0.5, "wires"), (-1.0, "wires"),
+])
+def test_wheel_that_stands_still_or_runs_backwards_is_named_after_2_s_and_a_turn(side, factor, words):
+    for speed in SPEEDS:
+        at_s, doubt = doubts_of(
+            lambda _, speed=speed: speed, lambda true, _: factor * true, seconds=60 / min(8, abs(speed)), side=side)[0]
+        assert max(2.0, math.tau / abs(speed)) <= at_s <= max(2.0, math.tau / abs(speed)) + 0.1
+        assert doubt.startswith(f"{('left', 'right')[side]} wheel turned ") and words in doubt and ";" in doubt
+        assert f" where {math.copysign(at_s * abs(speed), speed):.2g}"[:4] in doubt
+
+
+@pytest.mark.parametrize("own_time", [False, True])
+def test_encoder_that_froze_with_its_time_is_named(own_time):
+    found = doubts_of(lambda _: 10.0, lambda true, _: true, read_s=1e6, own_time=own_time, seconds=4.5)
+    assert [at_s for at_s, _ in found] == [2.0, 4.0]
+    assert all("left" in doubt and "right" in doubt for _, doubt in found)
+
+
+def test_wheel_that_is_not_commanded_is_not_compared():
+    """Not even with what was commanded before: an operator may have turned it by hand meanwhile."""
+    assert not doubts_of(lambda _: 0.0, lambda true, at_s: true - 3 * at_s)
+    assert not doubts_of(lambda at_s: 8.0 * (at_s % 2 < 1.5), lambda *_: 0.0)
+
+
+@pytest.mark.parametrize("jump", [-1000.0, -math.tau, math.tau, 5.5, 1e300])
+@pytest.mark.parametrize("speed", [0.0, 0.4, 2.0])
+def test_encoder_that_jumps_or_wraps_is_named_once(jump, speed):
+    [(at_s, doubt)] = doubts_of(lambda _: speed, lambda true, at_s: true + jump * (at_s >= 3), seconds=4)
+    assert at_s == 3.0 and doubt.startswith("left wheel jumped by ") and "look for a loose wire" in doubt
+
+
+@pytest.mark.parametrize("max_rad_s", [5.0, 22.0, 100.0])
+@pytest.mark.parametrize("read_s", [0.02, 0.5])
+def test_a_jump_is_what_twice_the_fastest_wheel_could_not_turn(max_rad_s, read_s):
+    drive = DiffDriveConfig(max_wheel_rad_s=max_rad_s)
+    bound = 2 * max_rad_s * max(read_s, 0.1) + 0.5
+    for angle_rad, is_found in ((0.99 * bound, False), (1.01 * bound, True)):
+        found = doubts_of(
+            lambda _: 0.0, lambda _, at_s, angle_rad=angle_rad: angle_rad * (at_s >= 3), drive, read_s=read_s)
+        assert bool(found) is is_found

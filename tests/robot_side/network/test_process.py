@@ -202,7 +202,8 @@ TYPE, VALUE = "camera raised TypeError: ", "camera raised ValueError: "
 
 @pytest.mark.parametrize(("change", "fault"), [
     ({"read": lambda _: b"jpeg"}, TYPE + "read() returned bytes; expected Picture or None"),
-    ({"read": lambda _: Picture(memoryview(b"jpeg"), 1)}, TYPE + "Picture.jpeg is memoryview; expected bytes | bytearray"),
+    ({"read": lambda _: Picture(memoryview(b"jpeg"), 1)},
+     TYPE + "Picture.jpeg is memoryview; expected bytes | bytearray"),
     ({"read": lambda _: Picture("jpeg", 1)}, TYPE + "Picture.jpeg is str; expected bytes | bytearray"),
     ({"read": lambda _: Picture(b"jpeg", 1.5)}, TYPE + "Picture.t_us is float; expected int"),
     ({"read": lambda _: Picture(b"jpeg", 1, 0)}, VALUE + "Picture.scale_percent is 0; expected 1 to 100"),
