@@ -10,8 +10,8 @@ import struct
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from types import FrameType
 from typing import Any, Final
@@ -69,6 +69,7 @@ _MAX_CONFIG_BYTES = 1 << 20
 # The process locks its memory, including stacks of usually 8 MB. Plug-in code needs a larger stack than this code.
 _STACK_BYTES, _PLUGIN_STACK_BYTES = 256 * 1024, 1024 * 1024
 _BATTERY_PERIOD_S = 1.0
+_SLOW_S = 3.0
 _STOP_REPORT_US = 100_000
 _REOPENS_US = 1_000_000
 _INVALID: Final = (ValueError, KeyError, struct.error, WireError)
@@ -87,9 +88,11 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
     if not is_restart:
         check_ports(config.listen)  # before the devices: a second robot on these ports may own the devices, too
     with ExitStack() as last, ExitStack() as ending:
-        drive: Drive = LostDrive(config.motors) if is_restart else DRIVES.build(config.motors)
+        with _slow_logged(config, f"drive {config.motors.kind}"):
+            drive: Drive = LostDrive(config.motors) if is_restart else DRIVES.build(config.motors)
         ending.callback(_close, "drive", drive)
-        ranges = RANGE_SENSORS.build(config.ranging) if config.ranging else None
+        with _slow_logged(config, f"range sensor {config.ranging.kind if config.ranging else ''}"):
+            ranges = RANGE_SENSORS.build(config.ranging) if config.ranging else None
         if ranges is not None:
             ending.callback(_close, "range sensor", ranges)
         threading.stack_size(_PLUGIN_STACK_BYTES)
@@ -110,6 +113,18 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
         # guardian after an error.
         ending.callback(_end, config, drive, guardian)
         return driver.loop()
+
+
+@contextmanager
+def _slow_logged(config: RobotConfig, device: str) -> Iterator[None]:
+    """Log the name of a device that takes long to open: until all are open a robot is silent."""
+    waiting = threading.Timer(_SLOW_S, _log.info, ["robot %s: waiting for the %s to open", config.robot, device])
+    waiting.daemon = True
+    waiting.start()
+    try:
+        yield
+    finally:
+        waiting.cancel()
 
 
 class LostDrive:

@@ -4,6 +4,7 @@ import errno
 import itertools
 import threading
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -16,6 +17,7 @@ from sightline.protocol.log import faults, report_fault
 from sightline.protocol.messages import Status, StreamStatus
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.driver import process as driver_process
 from sightline.robot_side.driver.persistence import StopLatch
 from sightline.robot_side.network import process as network_process
 from sightline.robot_side.network.process import NetworkProcess
@@ -104,6 +106,33 @@ def test_a_doubtful_encoder_is_counted_each_time_and_logged_ever_more_rarely(dri
     assert status.faults == {"encoder": 3} and status.state != "FAULT"
     lines = [one.message for one in caplog.records if one.levelname == "WARNING"]
     assert lines == 2 * ["robot r1: right wheel jumped by 1e+03 rad; look for a loose wire, or a counter that wraps"]
+
+
+@pytest.mark.parametrize(("slow", "waiting"), [
+    ("DRIVES", "drive log"), ("RANGE_SENSORS", "range sensor sim"), ("", None)])
+def test_a_device_that_takes_long_to_open_is_named_meanwhile(tmp_path, monkeypatch, caplog, slow, waiting):
+    caplog.set_level("INFO")
+    monkeypatch.setattr(driver_process, "_SLOW_S", 0.02)
+    monkeypatch.setattr(driver_process, "limit_core_dump", lambda: None)
+    monkeypatch.setattr(driver_process, "check_ports", lambda _: None)
+
+    class Device:
+        def close(self):
+            pass
+
+    for name in ("DRIVES", "RANGE_SENSORS"):
+        group = SimpleNamespace(build=lambda _, name=name: until(lambda: name != slow or caplog.messages) and Device())
+        monkeypatch.setattr(driver_process, name, group)
+
+    def fail(*_):
+        raise HardwareError("opened")
+
+    monkeypatch.setattr(driver_process, "start_log_thread", fail)
+    config = RobotConfig(robot="car", drive=PluginChoice(kind="log"), range_sensor=PluginChoice(kind="sim"))
+    with pytest.raises(HardwareError, match="opened"):
+        driver_process.run(config)
+    time.sleep(0.05)
+    assert caplog.messages == ([f"robot car: waiting for the {waiting} to open"] if waiting else [])
 
 
 class UnprintableError(RuntimeError):
