@@ -1,8 +1,9 @@
 """`sightline stop` against a real robot, direct and behind a router, with and without keys; each STOP also by UDP."""
 
+import json
 import subprocess
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 
 import pytest
 
@@ -14,15 +15,17 @@ from tests.fixtures.robot_process import RobotProcess, Vision
 COMMAND = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("secured", [False, True])
-@pytest.mark.parametrize("routed", [False, True])
-def test_stop_ends_with_zero_wheels_and_a_latch_on_disk(tmp_path, routed, secured):
+CASES = [part for number in range(22, 27) for part in ("--only", f"R-STOP-{number}")]
+
+
+@contextmanager
+def running_robot(folder, routed, secured):
+    """The robot, its endpoint or that of its router, and the options that name the keys."""
     endpoint, changes, secure = free_endpoint(), {}, []
     if secured:
-        keys.make(tmp_path / "keys", [])
-        endpoint, secure = endpoint.replace("tcp/", "tls/"), ["--secure", str(tmp_path / "keys")]
-        changes["secure"] = str(tmp_path / "keys")
+        keys.make(folder / "keys", [])
+        endpoint, secure = endpoint.replace("tcp/", "tls/"), ["--secure", str(folder / "keys")]
+        changes["secure"] = str(folder / "keys")
     if routed:
         changes |= {"listen": [], "connect": [endpoint]}
     with ExitStack() as ending:
@@ -32,9 +35,17 @@ def test_stop_ends_with_zero_wheels_and_a_latch_on_disk(tmp_path, routed, secure
             )
             ending.callback(router.terminate)
             assert " info router: on " in router.stdout.readline()
-        robot = ending.enter_context(RobotProcess(tmp_path, endpoint=endpoint, **changes))
+        robot = ending.enter_context(RobotProcess(folder, endpoint=endpoint, **changes))
         robot.wait_until_on()
-        ending.enter_context(Vision(endpoint, secure=changes.get("secure", "")))
+        yield robot, endpoint, secure
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("secured", [False, True])
+@pytest.mark.parametrize("routed", [False, True])
+def test_stop_ends_with_zero_wheels_and_a_latch_on_disk(tmp_path, routed, secured):
+    with running_robot(tmp_path, routed, secured) as (robot, endpoint, secure), \
+            Vision(endpoint, secure="".join(secure[1:])):
         assert until(lambda: robot.speed() > 0, START_S)
         done = subprocess.run(
             [*COMMAND, "stop", "r1", "--connect", endpoint, *secure], capture_output=True, text=True, timeout=30,
@@ -44,3 +55,14 @@ def test_stop_ends_with_zero_wheels_and_a_latch_on_disk(tmp_path, routed, secure
         assert "STOPPED" in done.stdout and "not on its disk" not in done.stderr
         assert robot.speed() == 0 and (tmp_path / "state" / "r1.stopped").exists()
         assert "STOP by a datagram" in robot.output(), "the datagram was first"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("routed", "secured"), [(False, False), (True, True)])
+def test_robot_passes_the_cases_about_its_stop_port(tmp_path, routed, secured):
+    with running_robot(tmp_path, routed, secured) as (_robot, endpoint, secure):
+        done = subprocess.run([*COMMAND, "conform", "robot", endpoint, *secure, *CASES, "--json"], capture_output=True,
+                              text=True, timeout=60, check=False)
+    outcomes = {one["name"]: one["value"] for one in json.loads(done.stdout)["checks"]}
+    keyed = "passed" if secured else "not applicable"
+    assert outcomes == {f"R-STOP-{number}": "passed" if number < 26 else keyed for number in range(22, 27)}, done.stderr
