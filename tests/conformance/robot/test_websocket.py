@@ -1,5 +1,6 @@
 """The cases with sockets of their own, in real time: our own links and a small server pass; and the raw client."""
 
+from pathlib import Path
 
 import pytest
 
@@ -29,6 +30,14 @@ def test_a_small_server_without_defect_passes(guarded):
     with small_server(guarded=guarded) as (bench, prepare):
         results = run_cases(cases, bench, prepare)
     assert {one.case.id: one.reason for one in results if one.outcome is Outcome.FAILED} == {}
+
+
+@pytest.mark.parametrize(("name", "outcome"), [("R-STOP-22", Outcome.PASSED), ("R-STOP-24", Outcome.SKIPPED)])
+def test_stop_port_whose_secret_the_kit_lacks_is_not_a_failure(name, outcome):
+    with small_server(guarded=True) as (bench, prepare):
+        (Path(bench.access.folder) / "stop.secret").unlink()
+        [result] = run_cases([case for case in REAL if case.id == name], bench, prepare)
+    assert result.outcome is outcome, result.reason
 
 
 @pytest.mark.long
