@@ -97,7 +97,8 @@ def _one_line(address: str) -> "Iterator[None]":
     except ValueError as error:
         raise ConfigError(f"model {address}: {' '.join(str(error).split())}"[:_LONGEST]) from None
     except Exception as error:  # frameworks raise their own classes for a bad file
-        text = " ".join(str(error).split())
+        # TorchScript gives its own traceback first.
+        text = " ".join(str(error).split()).rpartition("RuntimeError: ")[2]
         raise ConfigError(f"model {address} cannot be opened: {type(error).__name__}: {text}"[:_LONGEST]) from None
 
 
@@ -220,8 +221,10 @@ class _TorchEngine:
         pixels = np.zeros((1, 3, rows, columns), np.float32)
         try:
             outputs = self.run(pixels)
-        except RuntimeError:  # a script of torchvision takes a list
-            self._as_list = True
+        except RuntimeError as error:
+            if "List[Tensor]" not in str(error):
+                raise
+            self._as_list = True  # a script of torchvision
             outputs = self.run(pixels)
         names = metadata.get("names", {})
         table = {int(key): str(word) for key, word in names.items()} if isinstance(names, dict) else {}

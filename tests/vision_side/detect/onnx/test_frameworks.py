@@ -230,6 +230,39 @@ def test_torchscript_that_gives_something_else_is_one_line(torch, tmp_path: Path
         TorchDetector, address=str(tmp_path / "m.torchscript"), size=(96, 96))
 
 
+LISTED = """
+import torch
+from typing import Dict, List
+
+class Listed(torch.nn.Module):
+    def forward(self, images: List[torch.Tensor]) -> Dict[str, torch.Tensor]:
+        side = float(images[0].shape[1])
+        found = torch.tensor([[0.0, 0.0, side, side]], dtype=torch.float32)
+        return {"boxes": found, "scores": torch.ones(1), "labels": torch.zeros(1)}
+
+class Fails(torch.nn.Module):
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        return image.reshape(7, 11)
+"""
+
+
+@pytest.mark.slow
+def test_torchscript_that_takes_a_list_gets_one_and_any_other_reports_its_own_error(
+    torch, tmp_path: Path, monkeypatch
+) -> None:
+    """Before, a model that failed on an image got a list, too, and the line was about the list."""
+    (tmp_path / "my_scripts.py").write_text(LISTED)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    scripts = importlib.import_module("my_scripts")
+    for name in ("Listed", "Fails"):
+        torch.jit.script(getattr(scripts, name)()).save(str(tmp_path / name))
+    detector = made(TorchDetector, address=str(tmp_path / "Listed"), size=(64, 64))
+    assert len(result_of(detector).detections) == 1
+    for address in (str(tmp_path / "Fails"), "my_scripts:Fails"):
+        line = rejected(TorchDetector, address=address, size=(64, 64))
+        assert line.endswith("RuntimeError: shape '[7, 11]' is invalid for input of size 12288")
+
+
 @pytest.mark.slow
 def test_torchscript_that_is_cut_off_is_one_line(torch, tmp_path: Path) -> None:
     path = script(torch, random_yolo(torch, (6, 4)), tmp_path / "m.torchscript")
