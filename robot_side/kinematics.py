@@ -1,4 +1,4 @@
-"""Differential drive: twist <-> wheel speeds, saturation that preserves the curve, odometry, doubtful encoders. Pure."""
+"""Differential drive: twist <-> wheel speeds, saturation that preserves the curve, odometry, encoder checks. Pure."""
 
 import math
 from typing import Annotated
