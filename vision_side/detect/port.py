@@ -324,6 +324,12 @@ def _area(box: Corners) -> float:
     return (box[2] - box[0]) * (box[3] - box[1])
 
 
+def is_normalized(boxes: NDArray[np.floating]) -> bool:
+    """Return True if all boxes (K, 4) with an area lie within two pixels of the corner, as boxes from 0 to 1 do."""
+    areas = boxes[(boxes[:, 2:] > boxes[:, :2]).all(axis=1)]
+    return len(areas) > 0 and bool(areas.max() < NORMALIZED_PX)
+
+
 def detections_payload(result: DetectionResult) -> bytes:
     """Encode the boxes for the channel `detections`, best first. The last ones are dropped if it would be too long.
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from sightline.protocol.messages import MAX_DETECTED_BOXES
 from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.onnx.engine import OnnxHeader, Tensor
-from sightline.vision_side.detect.port import NORMALIZED_PX, Circle, Detection, clean_label, clipped
+from sightline.vision_side.detect.port import Circle, Detection, clean_label, clipped, is_normalized
 
 Arrays = Mapping[str, NDArray[Any]]
 _MAX_ROWS: Final = 100_000
@@ -235,8 +235,7 @@ def _check_corners(boxes: NDArray[Any]) -> None:
     if len(turned):
         raise ValueError(f"a box ({', '.join(f'{one:g}' for one in turned[0])}) ends before it begins; expected x1, "
                          "y1, x2, y2")
-    areas = boxes[(boxes[:, 2:] > boxes[:, :2]).all(axis=1)]
-    if len(areas) and areas.max() < NORMALIZED_PX:
+    if is_normalized(boxes):
         raise ValueError("all boxes lie within two pixels of the corner, as if from 0 to 1; export them in pixels of "
                          "the input")
 

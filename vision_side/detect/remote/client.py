@@ -26,6 +26,8 @@ from sightline.vision_side.detect.port import (
     Maker,
     clean_label,
     clipped,
+    corners,
+    is_normalized,
     result_of,
 )
 
@@ -161,8 +163,15 @@ def read_columns(
     if not (np.isfinite(boxes).all() and np.isfinite(scores).all()):
         raise NoAnswerError(NoAnswerReason.NOT_FINITE, "a box or score is nan or infinite")
     order = [int(row) for row in np.argsort(-scores, kind="stable") if scores[row] >= min_score]
+    _check_pixels(boxes[order])
     found = [_detection(boxes[row], float(scores[row]), labels[row], stretch, size_px) for row in order]
     return tuple(one for one in found if one)[:MAX_DETECTED_BOXES]
+
+
+def _check_pixels(boxes: Numbers) -> None:
+    if is_normalized(boxes):
+        raise NoAnswerError(NoAnswerReason.UNFIT, "all boxes lie within two pixels of the corner, as if from 0 to 1; "
+                                                  "let the server give pixels")
 
 
 def _check_shapes(boxes: Numbers, scores: Numbers, labels: Sequence[str]) -> None:
@@ -188,8 +197,13 @@ def _detection(
 
 
 def read_boxes(boxes: Sequence[DetectedBox], size_px: tuple[int, int], min_score: float) -> tuple[Detection, ...]:
-    """Convert boxes of the wire, which are valid one by one, to detections in the image, best first."""
-    found = [clipped(_of_wire(box), *size_px) for box in boxes if box.score >= min_score]
+    """Convert boxes of the wire, which are valid one by one, to detections in the image, best first.
+
+    Raises NoAnswerError for boxes that are not in pixels.
+    """
+    counted = [_of_wire(box) for box in boxes if box.score >= min_score]
+    _check_pixels(np.array([corners(one) for one in counted], np.float64).reshape(-1, 4))
+    found = [clipped(one, *size_px) for one in counted]
     return tuple(sorted((one for one in found if one), key=lambda one: one.score, reverse=True))
 
 

@@ -129,6 +129,7 @@ HOSTILE = {
     "no boxes field of the right kind": (http_reply(said()[:-1] + b',"boxes":5}'), "MALFORMED"),
     "box of three": (http_reply(said({"label": "a", "score": 1, "x1_px": 1, "y1_px": 1, "x2_px": 9})), "MALFORMED"),
     "text for a number": (http_reply(said(box(x1="7"))), "MALFORMED"),
+    "normalized": (http_reply(said(box(0.1, 0.2, 0.4, 0.6), box(0.2, 0.2, 0.9, 1.0))), "UNFIT"),
     "nan": (http_reply(said(box(x1=float("nan")))), "NOT_FINITE"),
     "infinite": (http_reply(said(box(x2=float("inf")))), "NOT_FINITE"),
     "score of two": (http_reply(said(box(score=2.0))), "MALFORMED"),

@@ -125,6 +125,14 @@ def test_boxes_in_the_models_pixels_become_those_of_the_image():
     assert (one.x1_px, one.y1_px, one.x2_px, one.y2_px, one.label) == (20, 30, 40, 60, "ball")
 
 
+@pytest.mark.parametrize(("boxes", "scores", "count"), [
+    ([[0, 0, 1, 2.0]], [0.9], 1), ([[0.1, 0.1, 0.9, 0.9], [5, 5, 9, 9]], [0.9, 0.9], 2),
+    ([[0.1, 0.1, 0.9, 0.9], [5, 5, 9, 9]], [0.2, 0.9], 1), ([[0, 0, 0, 0]], [0.9], 0),
+])
+def test_small_boxes_in_pixels_are_an_answer(boxes, scores, count):
+    assert len(_found(read_infer(*_binary(boxes, scores, [0] * len(scores)), ASKED))) == count
+
+
 BOXES = [[10, 20, 30, 40]]
 ANSWERS = {
     "nan box": (_binary([[np.nan, 0, 1, 1]], [0.9], [0]), NoAnswerReason.NOT_FINITE),
@@ -135,6 +143,7 @@ ANSWERS = {
     "more scores": (_binary(BOXES, [0.9, 0.9], [0]), NoAnswerReason.MALFORMED),
     "more labels": (_binary(BOXES, [0.9], [0, 1]), NoAnswerReason.MALFORMED),
     "inside out": (_binary([[30, 20, 10, 40]], [0.9], [0]), NoAnswerReason.MALFORMED),
+    "normalized": (_binary([[0.1, 0.2, 0.3, 0.4], [0.5, 0.5, 1.1, 1.9]], [0.9, 0.8], [0, 0]), NoAnswerReason.UNFIT),
     "score of two": (_binary(BOXES, [2.0], [0]), NoAnswerReason.MALFORMED),
     "too many rows": (_binary(np.zeros((1025, 4)), np.zeros(1025), np.zeros(1025)), NoAnswerReason.TOO_MANY),
     "other frame": (_binary(BOXES, [0.9], [0], id="0000abcd-2"), NoAnswerReason.OTHER_FRAME),
