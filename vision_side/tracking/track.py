@@ -311,7 +311,8 @@ class Track:
             is_apart = all(one.away_m(place) > apart_m for one in self._objects())
             if is_apart and place not in fits.values() and len(self._others) < _MAX_OTHERS:
                 self._others.append(self._new(place))
-                self._others[-1].was_beside |= is_slow and target is not None and target.is_known
+                if is_slow and target is not None and target.is_known:
+                    self._others[-1].was_beside = True
 
     def _new(self, place: _Place) -> _Object:
         return _Object(place, self._config.acceleration_mps2)
