@@ -232,7 +232,7 @@ def install(
             second = "; with a gpio drive in it, a second file sets the pins low" if service == "robot" else ""
             typer.echo(f"{file} does not exist yet{second}; create it before --yes", err=True)
         return
-    units.check_user(runs_it)
+    units.check_user(runs_it, program, file)
     if state_dir is not None and not state_dir.is_dir():  # systemd would not start the service
         raise ConfigError(f"state_dir {state_dir} does not exist; run: sudo install -d -o {runs_it} {state_dir}")
     stale = units.drop_in_path(planned.path.parent)

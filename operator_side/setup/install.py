@@ -72,12 +72,29 @@ def plan(
     return InstallPlan(service, unit_dir / name, _fitted(unit, service, program, config), units)
 
 
-def check_user(user: str) -> None:
-    """Raise ConfigError for an unknown account, because systemd would not start the service."""
+def check_user(user: str, program: Path, config: Path) -> None:
+    """Check that the account exists, and under sudo that it may use the files. Otherwise the service would not start.
+
+    Raises:
+        ConfigError: the account does not exist, or may not use a file.
+    """
     try:
-        pwd.getpwuid(int(user)) if user.isdigit() else pwd.getpwnam(user)
+        account = pwd.getpwuid(int(user)) if user.isdigit() else pwd.getpwnam(user)
     except (KeyError, ValueError, OverflowError):
         raise ConfigError(f"unknown user '{user}'; create the account or name another one with --user") from None
+    for test, path in (("-x", program), ("-x", program.with_name("python")), ("-r", config)):
+        if os.geteuid() == 0 and not _permits(account, test, path):
+            what = "execute" if test == "-x" else "read"
+            raise ConfigError(f"user '{user}' may not {what} {path}; name another account with --user, or move it, "
+                              f"e.g. to {'/opt/sightline' if test == '-x' else '/etc/sightline'}")
+
+
+def _permits(account: pwd.struct_passwd, test: str, path: Path) -> bool:
+    """Return whether test(1), run by the account, passes."""
+    groups = os.getgrouplist(account.pw_name, account.pw_gid)
+    return not subprocess.run(
+        ["test", test, path], user=account.pw_uid, group=account.pw_gid, extra_groups=groups, cwd="/", check=False
+    ).returncode
 
 
 def with_state_in(planned: InstallPlan, folder: Path) -> InstallPlan:

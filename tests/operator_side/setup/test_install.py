@@ -2,6 +2,11 @@
 
 import configparser
 import errno
+import os
+import pwd
+import re
+import tempfile
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -187,7 +192,7 @@ def vision(monkeypatch, tmp_path):
 
     monkeypatch.setattr(install, "UNIT_DIR", units)
     monkeypatch.setattr(install, "_systemctl", systemctl)
-    monkeypatch.setattr(install, "check_user", lambda _user: None)
+    monkeypatch.setattr(install, "check_user", lambda *_: None)
     return ["install", "vision", "--config", str(file), "--user", "pi"], units, calls
 
 
@@ -291,7 +296,7 @@ def car(monkeypatch, tmp_path):
     units.mkdir()
     monkeypatch.setattr(install, "UNIT_DIR", units)
     monkeypatch.setattr(install, "_systemctl", told.append)
-    monkeypatch.setattr(install, "check_user", lambda _user: None)
+    monkeypatch.setattr(install, "check_user", lambda *_: None)
     return file, units, told
 
 
@@ -368,3 +373,26 @@ def test_missing_configuration_is_reported(car, capsys):
     assert "does not exist yet; with a gpio drive" in capsys.readouterr().err
     assert cli.run(["install", "vision", "--config", str(file), "--user", "pi"]) == 0
     assert f"{file} does not exist yet; create it before --yes" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can try the rights of another account")
+@pytest.mark.parametrize(("closed", "problem"), [
+    ("", ""), ("bin/sightline", "may not execute {}/bin/sightline; name another account with --user"),
+    ("bin/python", "may not execute {}/bin/python;"), ("bin", "may not execute {}/bin/sightline;"),
+    ("robot.toml", "may not read {}/robot.toml; name another account with --user, or move it, e.g. to /etc/sightline"),
+])
+def test_account_that_may_not_use_program_or_configuration_is_rejected(closed, problem):
+    with tempfile.TemporaryDirectory() as name:  # the folder of pytest is closed to other accounts
+        folder = Path(name)
+        (folder / "bin").mkdir()
+        program, config = folder / "bin" / "sightline", folder / "robot.toml"
+        for path in (program, program.with_name("python"), config):
+            path.touch()
+            path.chmod(0o755)
+        folder.chmod(0o755)
+        if closed:
+            (folder / closed).chmod(0o700)
+        for user in ("nobody", str(pwd.getpwnam("nobody").pw_uid)):
+            with pytest.raises(ConfigError, match=re.escape(problem.format(folder))) if closed else nullcontext():
+                check_user(user, program, config)
+        check_user("root", program, config)
