@@ -112,6 +112,8 @@ def check_scan(scan: object) -> None:
         raise TypeError(f"read() returned {type(scan).__name__}; expected Ranges or None")
     if not isinstance(scan.t_us, int):
         raise TypeError(f"Ranges.t_us is {type(scan.t_us).__name__}; expected int")
+    if not 0 <= scan.t_us < 2**53:  # what a message can hold
+        raise ValueError(f"Ranges.t_us is {scan.t_us}; take the robot's clock, in microseconds")
     for name in ("angle_min_rad", "angle_increment_rad", "range_min_m", "range_max_m"):
         if math.isnan(getattr(scan, name)):
             raise ValueError(f"Ranges.{name} is nan")

@@ -78,6 +78,8 @@ SCAN = Ranges(1, 0.0, 0.1, 0.05, 8.0, array.array("f", [1.0]))
 
 @pytest.mark.parametrize(("scan", "text"), [
     (None, r"read\(\) returned NoneType"), (replace(SCAN, t_us=1.5), "Ranges.t_us is float"),
+    (replace(SCAN, t_us=-1), "Ranges.t_us is -1; take the robot's clock"),
+    (replace(SCAN, t_us=2**53), "Ranges.t_us is 9007199254740992; take"),
     (replace(SCAN, range_max_m=math.nan), "Ranges.range_max_m is nan"),
     (replace(SCAN, angle_min_rad=math.nan), "Ranges.angle_min_rad is nan"),
     (replace(SCAN, ranges_m=array.array("f", [1.0]) * 16_385), "a scan of 16385 rays; at most 16384"),
@@ -86,6 +88,8 @@ def test_wrong_scan_is_named(scan, text):
     with pytest.raises((TypeError, ValueError), match=text):
         check_scan(scan)
     check_scan(replace(SCAN, ranges_m=array.array("f", [1.0]) * 16_384))
+    for t_us in (0, 2**53 - 1):
+        check_scan(replace(SCAN, t_us=t_us))
 
 
 def page_with_table(text: str) -> str:
