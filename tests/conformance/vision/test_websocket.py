@@ -16,6 +16,7 @@ from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.serving import service
 from sightline.vision_side.serving.process import serve
 from tests.conformance.mutants.sockets import our_vision, plain_vision, played_robot
+from tests.conformance.vision.sockets import SocketVision
 from tests.fixtures.ports import free_endpoint
 
 REAL = [case for case in CASES if case.real]
@@ -43,6 +44,17 @@ def test_a_good_vision_passes_them_all(vision):
     with played_robot(vision) as (bench, _prepare):
         results = [run_case(case, bench) for case in REAL]
     assert {one.case.id: one.reason for one in results if one.outcome is not Outcome.PASSED} == {}
+
+
+@pytest.mark.parametrize(("name", "message"), [
+    ("V-HEAD-02", (700).to_bytes(2) + b"{" + b" " * 698 + b"}0.0000|0.0000"), ("V-SOCK-06", "0.0000|0.0000")])
+def test_answer_with_a_long_block_or_as_a_text_fails(monkeypatch, name, message):
+    monkeypatch.setattr(SocketVision, "answer", lambda self, link, frame: link.send(message))
+    case = next(case for case in CASES if case.id == name)
+    with played_robot(plain_vision) as (bench, _prepare):
+        assert bench.wait(lambda: bench._links["robot"].connected, 5_000_000)
+        result = run_case(case, bench)
+    assert result.outcome is Outcome.FAILED, result.reason
 
 
 def test_vision_service_that_swaps_the_axes_exits_with_5(capsys, monkeypatch):
