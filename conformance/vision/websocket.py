@@ -13,7 +13,7 @@ import ssl
 import struct
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any, Final, Self
 
@@ -43,6 +43,7 @@ SESSION_BEGINS: Final = "5ca1"
 """Distinguishes this server from the kit's own link in the tests."""
 _GUID: Final = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 _SEND_S: Final = 2.0
+_REQUEST_BYTES: Final = 16_384
 
 
 class RawServer:
@@ -80,7 +81,7 @@ class RawServer:
         return None
 
     def turn_away(self, within_s: float) -> float:
-        """Close the next connection without a word. Returns the seconds until it came; infinite if none came."""
+        """Answer the next request with 503. Returns the seconds until it came; infinite if none came."""
         began_s = time.monotonic()
         self._socket.settimeout(within_s)
         try:
@@ -88,7 +89,13 @@ class RawServer:
         except TimeoutError:
             return math.inf
         came_s = time.monotonic() - began_s
-        connection.close()
+        # Without an answer some HTTP libraries repeat a request by themselves.
+        with suppress(OSError), connection:
+            connection.settimeout(_SEND_S)
+            secured = connection if self._tls is None else self._tls.wrap_socket(connection, server_side=True)
+            with secured:
+                secured.recv(_REQUEST_BYTES)
+                secured.sendall(b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
         return came_s
 
     def __enter__(self) -> Self:
