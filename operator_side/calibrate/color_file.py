@@ -76,6 +76,8 @@ def _item(ranges: Ranges, old: Item | None) -> Any:
 
 def check_config(path: Path) -> None:
     """Raise ConfigError for an invalid or unwritable configuration of the vision service."""
+    if path.exists() and not path.is_file():  # a pipe would block, and a device would become a file
+        raise ConfigError(f"cannot write {path}: it is not a regular file; choose another file")
     if path.exists():
         load_service("vision", file=str(path), environ={})
     elif not path.parent.is_dir():

@@ -1,6 +1,7 @@
 """Color ranges are written into a configuration of vision: all comments and values stay, or nothing changes."""
 
 import json
+import os
 import re
 import stat
 import tomllib
@@ -88,6 +89,14 @@ def test_vision_reads_the_written_ranges(tmp_path):
         check_config(tmp_path / "bad.toml")
     with pytest.raises(ConfigError, match="no folder"):
         check_config(tmp_path / "none" / "vision.toml")
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, Path.mkdir, lambda path: path.symlink_to("/dev/null")])
+def test_pipe_device_or_folder_is_not_a_configuration_to_write(make, tmp_path):
+    """A pipe without a writer would block the command; a device would be replaced by the file."""
+    make(tmp_path / "vision.toml")
+    with pytest.raises(ConfigError, match=r"vision\.toml: it is not a regular file; choose another file"):
+        check_config(tmp_path / "vision.toml")
 
 
 @pytest.mark.parametrize("before", ["", "robot = 'r1'", "robot = 'r1'\n", "robot = 'r1'\r\n[hsv]\n"])
