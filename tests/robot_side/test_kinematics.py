@@ -259,7 +259,8 @@ def test_wheel_that_slips_or_has_a_wrong_radius_is_not_doubted(factor):
 
 @pytest.mark.parametrize("side", [0, 1])
 @pytest.mark.parametrize(("factor", "words"), [
-    (0.0, "is it blocked"), (0.0995, "is it blocked"), (0.05, "is it blocked"), (-0.05, "is it blocked"), (-0.5, "wires"), (-1.0, "wires"),
+    (0.0, "is it blocked"), (0.0995, "is it blocked"), (0.05, "is it blocked"),
+    (-0.05, "is it blocked"), (-0.5, "wires"), (-1.0, "wires"),
 ])
 def test_wheel_that_stands_still_or_runs_backwards_is_named_after_2_s_and_a_turn(side, factor, words):
     for speed in SPEEDS:
