@@ -57,7 +57,7 @@ class HsvConfig(Config):
 
 
 Device = Literal["auto", "cpu", "cuda", "tensorrt"]
-"""Device of a model. `auto` uses the best available device and logs it. The start fails without any other device."""
+"""Device of a model. `auto` uses the best available device and logs it. Any other must exist at the start."""
 
 
 class DetectorConfig(Config):

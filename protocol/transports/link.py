@@ -321,7 +321,11 @@ class FleetLink(Closing):
 
     @abstractmethod
     def declare_token(self, token: AnyToken) -> Callable[[], None]:
-        """Declare a token. It ends with a call of the returned function, or with the session or process."""
+        """Declare a token, which ends with the session or process.
+
+        Returns:
+            A function that ends the token. The caller must store it.
+        """
 
     @abstractmethod
     def watch_tokens(self, callback: Callable[[Token, bool], None]) -> Callable[[], None]:

@@ -36,7 +36,7 @@ class StopLatch:
         return True
 
     def write(self, stopped: bool) -> None:
-        """Write or remove the mark. After the return it survives a power cut. May wait for the disk."""
+        """Write or remove the mark. After the return a power cut cannot undo this. May wait for the disk."""
         if stopped:
             with self._path.open("ab") as mark:
                 os.fsync(mark.fileno())

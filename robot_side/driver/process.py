@@ -109,8 +109,8 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
         ending.callback(driver.finish)
         if guardian is not None:
             guardian.wait()
-        # Runs first, because the stack is last in, first out: every end sets the motors to zero, at least by the
-        # guardian after an error.
+        # Runs first, because the stack is last in, first out. However the loop ends, this sets the motors to zero.
+        # If it fails, the guardian does it.
         ending.callback(_end, config, drive, guardian)
         return driver.loop()
 

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from typing import Final
 
 EXIT_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
-"""Signals from keys and terminals, with Ctrl-\\ and Ctrl-Z. The driver first sets the wheels to zero and then ends,
-because a driver that is killed or stopped leaves the wheels turning."""
+"""Signals of supervisors, keys and terminals, also Ctrl-\\ and Ctrl-Z. The driver sets the wheels to zero before it
+ends, because a driver that is killed or stopped leaves the wheels turning."""
 IGNORED_SIGNALS: Final = (signal.SIGTTIN, signal.SIGTTOU)
 """Signals that would stop a process in the background of a terminal."""
 

@@ -72,7 +72,7 @@ class HeartbeatMonitor:
 
     @property
     def drive_failed(self) -> bool:
-        """Return True if the driver ends without zero wheel speeds."""
+        """Return True if the drive rejected zero at the end of the driver."""
         return self._last == FAILED
 
     @property

@@ -98,7 +98,7 @@ class ReceiverCore:
             robot: robot id.
             secret: STOP secret, or b"" to accept every STOP.
             challenge: random bytes of this start.
-            number: first STOP number. It is above the numbers of any earlier receiver, e.g. the time since boot, us.
+            number: number before the first STOP. No earlier receiver reached it, e.g. the time since boot, us.
         """
         self._robot, self._secret, self._challenge = robot, secret, challenge
         self._received = self._sent = self._applied = number

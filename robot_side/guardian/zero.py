@@ -32,7 +32,7 @@ def load_zero(named: Mapping[str, Any]) -> Callable[[Mapping[str, Any]], None]:
 
 
 def write_note(setup: Mapping[str, Any]) -> None:
-    """Note the drive of this start where systemd keeps files of a service until it ends, if that starts this process.
+    """Store the drive of this start for `main`, if systemd runs this process. It keeps the folder until the last stop.
 
     Raises:
         OSError: it cannot be written.

@@ -295,7 +295,7 @@ class GpioDriveConfig(TableConfig):
     table_file: Path | None = None
     """File of `sightline calibrate drive`, in place of `table`."""
     odometry: Literal["table", "none"] = "table"
-    """Without encoders: `table` predicts the wheel angles from the table, `none` gives none."""
+    """Without encoders: `table` predicts the wheel angles from the table, `none` gives no angles."""
     wheel_radius_m: Annotated[float, Field(gt=0.005, lt=1.0)]
     """Set from `wheels.wheel_radius_m` of the robot."""
 

@@ -9,8 +9,8 @@ Loss is not a queue. Frames without an answer between two answers at floor delay
 a row as their statistics explain, change nothing: the stream continues at its rate. A queue delays the answers, and an
 outage lasts longer. Then the stream slows down.
 
-Sources: BBR (Linux, `net/ipv4/tcp_bbr.c`): the lowest recent delay is that of the path, it gives the data in flight,
-and loss is not a signal. WebRTC (draft-ietf-rmcat-gcc-02): a growing delay lowers the rate. Its separate controller for
+Sources: BBR (Linux, `net/ipv4/tcp_bbr.c`): the lowest recent delay is that of the path and gives the data in flight.
+A loss is not a signal. WebRTC (draft-ietf-rmcat-gcc-02): a growing delay lowers the rate. Its separate controller for
 loss ignores a few percent. Here no share of loss counts, because a slower stream loses the same share. Both sources
 wait for answers. Here a silence counts, too, because a robot without commands must stop.
 """

@@ -191,7 +191,8 @@ class SafetyGate:
         if limited != twist:
             self.counters[CLAMPED] += 1
         life_ms = min(config.silence_ms, config.guest_life_ms) if guest else config.silence_ms
-        # Without a header the age of the image is unknown. The age counts from arrival, and repeats are limited.
+        # Without a header the age of the image is unknown. The command's age counts from its arrival, and it may repeat
+        # only briefly.
         if age_us is None:
             self._repeats.add(twist, now_us)
         self._command = AcceptedCommand(limited, now_us - (age_us or 0), now_us, life_ms * 1000, age_us is not None)

@@ -112,7 +112,7 @@ class Lease:
             del self._tokens[next(one for one in self._tokens if one != self.token)]
 
     def end_token(self, token: str, now_us: int) -> bool:
-        """Return True if this token ended the current lease. Its session never drives again."""
+        """Return True if this token ended the current lease. Its session never drives again, even if it expired."""
         if token in self._tokens:
             del self._tokens[token]
             self._ended[token] = now_us

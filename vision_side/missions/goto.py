@@ -162,7 +162,7 @@ class GotoConfig(Config):
     sight_m: Annotated[float, Field(gt=0, le=50)] = 0.2
     """Range of the sensors beyond the robot's front. It limits the speed into unknown space."""
     clearance_m: Annotated[float, Field(ge=0.01, le=2)] = 0.112
-    """Distance between the robot's outline and any echo."""
+    """Least distance between the robot's outline and any echo."""
     tolerance_m: Annotated[float, Field(ge=0.01, le=1)] = 0.05
     max_linear_mps: Annotated[float, Field(gt=0, le=2)] = 0.5
     max_angular_rad_s: Annotated[float, Field(gt=0, le=6)] = 2.5

@@ -61,7 +61,7 @@ class Client:
         self._serve, self._count_rejection, self._max_bytes = serve, count_rejection, max_bytes
         self._closing = threading.Event()
         self.trouble = ""
-        """Cause of the last failure, for the operator. Empty before the first answer."""
+        """Cause of the last failure, for the operator. Empty while no peer answers."""
         self.turned_away = threading.Event()
         """Set when a peer has answered and rejects this end permanently."""
         threading.Thread(target=self._run, name="websocket-dial", daemon=True).start()

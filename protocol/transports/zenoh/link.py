@@ -460,7 +460,11 @@ class ZenohFleet(FleetLink):
         self._ending.close()
 
     def declare_token(self, token: AnyToken) -> Callable[[], None]:
-        """Declare a token. It ends with a call of the returned function, or with the session or process."""
+        """Declare a token, which ends with the session or process.
+
+        Returns:
+            A function that ends the token. The caller must store it.
+        """
         return declare_token(self._session, token)
 
     def watch_tokens(self, callback: Callable[[Token, bool], None]) -> Callable[[], None]:

@@ -1,4 +1,4 @@
-"""The lens of a camera plug-in: a calibrated model from a file or options, otherwise a guess. Shell.
+"""The lens of a camera plug-in: a calibrated model from a file or options, else a guess from its angle. Shell.
 
 The file has the format of `sightline calibrate camera`: the fields of `sightline.protocol.messages.CameraModel` as
 TOML.
