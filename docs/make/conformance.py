@@ -34,9 +34,9 @@ START_S = 90.0
 TOKEN = "conformance-0123456789abcdef"
 
 PREFACE = """`python -m docs.make.conformance` runs the kit over these peers and writes this page. A case that a peer's
-choices leave nothing to test in (no guests, no scan, no port of the legacy protocol, no token, another transport)
-counts as not applicable. Most cases of a vision service need its twists, so one that never drives does not conform. Nor
-does a peer with a MUST that was left although the cases of what it needs passed.
+choices leave nothing to test in (no guests, scan, token or STOP port, no port of the legacy protocol, another
+transport) counts as not applicable. Most cases of a vision service need its twists, so one that never drives does not
+conform. Nor does a peer with a MUST that was left although the cases of what it needs passed.
 The minimal peers are the examples of [Implement a peer](../../tutorials/implement-a-peer.md): they leave out clauses on
 purpose and therefore do not conform.
 Clauses are those of [protocol/README.md](https://github.com/sightline-robot/sightline/blob/main/protocol/README.md)."""
