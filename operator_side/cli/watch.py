@@ -182,7 +182,7 @@ def capture(
 ) -> None:
     """Save an image, a video or a recording of a robot
 
-    With --seconds or an .mp4 file it saves a video, with an .mcap file all messages. Ctrl-C ends both early.
+    With --seconds or an .mp4 file it saves a video, with an .mcap file the messages. Ctrl-C ends both early.
     """
     with needs("vision"):
         from sightline.operator_side.recording.film import MESSAGES, PICTURES, check_target, film, record, snapshot

@@ -200,7 +200,7 @@ def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Cap
 
 
 def record(link: Link, pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Recorder:
-    """Write all messages of `seconds`, or until Ctrl-C, SIGTERM or SIGHUP, to `path`. `wanted` may add the overlay.
+    """Write the messages of `seconds`, or until Ctrl-C, SIGTERM or SIGHUP, to `path`. `wanted` may add the overlay.
 
     Raises LinkError if none arrives, ConfigError for a file that cannot be written to its end.
     """
