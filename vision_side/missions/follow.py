@@ -87,7 +87,7 @@ class Follow:
         return max(view.dt_s, (view.header.t_us - last_us) / 1e6)
 
     def _receive(self, view: View) -> None:
-        """Update the latency estimate, and the integrals by the applied twist."""
+        """Update the latency estimate. Shrink the integrals by a command that the robot did not apply."""
         header, dt_s = view.header, view.dt_s
         self._motion_predictor.measure(header.latency_us, dt_s)
         expected = self._motion_predictor.expected(header.t_us)

@@ -15,7 +15,7 @@ from sightline.protocol.config import Config
 from sightline.protocol.messages import Pose
 
 _MAX_BLOCKS = 64
-_SAME_M = 0.20  # two blocks have a larger distance; the measured place of a far block is this inaccurate
+_SAME_M = 0.20  # two blocks have a larger distance; the measured place of a far block is off by this
 _SAME_SHARE = 0.12  # ... plus this share of its distance
 _BEHIND_M, _AHEAD_M = 1.2, 2.5  # part of the row that defines the local direction of the lane
 _MIN_SPREAD_M = 0.4  # blocks with a smaller distance along the lane define no direction

@@ -19,7 +19,7 @@ from sightline.vision_side.missions.registry import MissionSpec
 from sightline.vision_side.tracking.track import Target
 
 SETTLE_S: Final = 1.0
-"""Longest wait for a standing robot. After it the new mission starts: the motion is not caused by these commands."""
+"""Longest wait until the robot stands. The new mission then starts anyway, because another cause moves the robot."""
 STILL_MPS: Final = 0.01
 STILL_RAD_S: Final = 0.03
 MAX_COMMAND: Final = 1000.0

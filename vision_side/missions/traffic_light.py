@@ -19,7 +19,7 @@ from sightline.vision_side.tracking.track import to_odometry
 
 _FRAMES = 2  # green counts after this many readings without another color or UNKNOWN between; others immediately
 _AT_REST_MPS = 0.01
-_CROSSED_M = 0.15  # further beyond the line the robot has crossed it, or started there; stopping is more exact
+_CROSSED_M = 0.15  # a robot further beyond the line has crossed it, or started there: its stops are more exact
 
 
 class StopConfig(Config):

@@ -80,8 +80,8 @@ _LONGEST: Final = 160
 _REPORTED_AT: Final = frozenset(10**power for power in range(10))
 """The 1st, 10th, 100th ... rejection of a kind is logged. A change between good and bad answers is logged, too."""
 _IN_A_ROW: Final = 10
-"""Good answers, or rejections, in a row after which the log reports a bad server again. Without it, a fleet with one
-robot that gets no answers would log a line for each frame."""
+"""After this many good answers or rejections in a row, the log reports a bad server again. Otherwise, if a server
+answers all robots but one, the log would have a line for each frame."""
 
 
 class NoAnswerReason(StrEnum):
