@@ -62,7 +62,7 @@ def test_units_command_ends_with_the_command_that_needs_no_note():
     words = shlex.split(lines["ExecStopPost"])
     assert words[:4] == ["/opt/sightline/bin/python", "-P", "-m", zero.__name__]
     assert words[4:] == [*shlex.split(lines["ExecStart"]), "--zero-motors"]
-    assert "\nRuntimeDirectory=" in UNIT.read_text(), "without it systemd gives no folder for the note"
+    assert "\nRuntimeDirectory=%N\n" in UNIT.read_text(), "a folder for the note, which no copy of the unit shares"
 
 
 def test_a_note_needs_no_package_but_those_of_the_drive(tmp_path, folder):
