@@ -100,6 +100,8 @@ _SIDES = "left", "right"
 _AT_ONCE_US, _STEP_RAD = 100_000, 0.5
 """A drive may return a reading of up to 100 ms before with a new time; a coarse encoder has a dozen steps a turn."""
 
+_LATEST_US = 100_000  # between two calls; a robot that was suspended for longer commanded nothing meanwhile
+
 
 class WheelMonitor:
     """Compares the encoder of one wheel with its commanded speed."""
@@ -157,7 +159,7 @@ class EncoderMonitor:
             wheels: newest reading; finite.
             now_us: time on the robot's clock.
         """
-        seconds = 0.0 if self._looked_us is None else (now_us - self._looked_us) / 1e6
+        seconds = 0.0 if self._looked_us is None else min(now_us - self._looked_us, _LATEST_US) / 1e6
         self._looked_us = now_us
         angles = wheels.left_rad, wheels.right_rad
         doubts = [f"{side} wheel {doubt}"

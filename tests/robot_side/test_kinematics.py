@@ -278,6 +278,14 @@ def test_encoder_that_froze_with_its_time_is_named(own_time):
     assert all("left" in doubt and "right" in doubt for _, doubt in found)
 
 
+@pytest.mark.parametrize("gap_s", [60, 3600])
+def test_wheel_of_a_robot_that_was_suspended_while_it_drove_is_not_doubted(gap_s):
+    monitor, angle_rad = EncoderMonitor(DRIVE), 0.0
+    for at_us in [*range(0, 1_000_000, 20_000), *range(gap_s * 1_000_000, gap_s * 1_000_000 + 9_000_000, 20_000)]:
+        assert not monitor.look((8.0, 8.0), WheelAngles(angle_rad, angle_rad, at_us), at_us)
+        angle_rad += 8.0 * 0.02
+
+
 def test_wheel_that_is_not_commanded_is_not_compared():
     """Not even with what was commanded before: an operator may have turned it by hand meanwhile."""
     assert not doubts_of(lambda _: 0.0, lambda true, at_s: true - 3 * at_s)
