@@ -100,6 +100,7 @@ def plugin_prints(as_json: bool) -> Iterator[None]:
         with redirect_stdout(sys.stderr):
             yield
     finally:
+        sys.stdout.flush()  # of a plug-in that imported it by name
         ctypes.CDLL(None).fflush(None)  # C keeps in its buffer what it prints to a pipe
         os.dup2(stdout, 1)
         os.close(stdout)

@@ -474,6 +474,15 @@ def test_what_the_c_code_of_a_plug_in_prints_is_not_in_the_json(capfd, as_json, 
     assert {"python", "C", "system"} <= set(meant.split()) and other == ("{}\n" if as_json else "")
 
 
+def test_what_a_plug_in_prints_to_a_stdout_that_it_imported_by_name_is_not_in_the_json():
+    script = ("from sys import stdout; from sightline.operator_side.cli.options import plugin_prints\n"
+              "with plugin_prints(True): stdout.write('plug-in')\n"
+              "print('{}')")
+    environ = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environ, check=True)
+    assert (done.stdout, done.stderr) == ("{}\n", "plug-in")
+
+
 @pytest.mark.parametrize(("arguments", "used"), [
     (["doctor"], ["operator_side.cli.admin._findings"]),
     (["score", "--scenario", "static"], ["evaluation.score.runs.run_cases"]),
