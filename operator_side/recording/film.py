@@ -6,7 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -202,24 +202,24 @@ def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Cap
 def record(link: Link, pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Recorder:
     """Write the messages of `seconds`, or until Ctrl-C, SIGTERM or SIGHUP, to `path`. `wanted` may add the overlay.
 
-    Raises LinkError if none arrives, ConfigError for a file that cannot be written to its end.
+    A file that is there already stays until then. Raises LinkError if none arrives, ConfigError for a file that cannot
+    be written to its end.
     """
+    target = Path(os.path.realpath(path))
+    beside = whole(target, MESSAGES) if target.is_file() else nullcontext(target)
     ends_s, has_begun = time.monotonic() + PATIENCE_S, False  # the end is counted from the first message
     channels = dict.fromkeys((*RECORDED, wanted))
-    with (
-        _terminated_like_ctrl_c(),
-        Recorder(link, path, {"robot": link.robot}, channels) as recorder,
-        suppress(KeyboardInterrupt),
-    ):
-        while (left_s := ends_s - time.monotonic()) > 0 and not recorder.failed:
-            pictures.take(min(left_s, _WAIT_S))  # it acknowledges frames, which no client does without a vision service
-            if recorder.counts and not has_begun:
-                ends_s, has_begun = time.monotonic() + seconds, True
+    with _terminated_like_ctrl_c(), writes(path), beside as part:
+        with Recorder(link, part, {"robot": link.robot}, channels) as recorder, suppress(KeyboardInterrupt):
+            while (left_s := ends_s - time.monotonic()) > 0 and not recorder.failed:
+                pictures.take(min(left_s, _WAIT_S))  # it acknowledges frames; without a vision service no client does
+                if recorder.counts and not has_begun:
+                    ends_s, has_begun = time.monotonic() + seconds, True
+        if not (recorder.failed or recorder.counts):
+            part.unlink()
+            raise LinkError(_silence(pictures, wanted))
     if recorder.failed:
         raise ConfigError(f"recording {path} ends early: {recorder.failed}; free some space or name another file")
-    if not recorder.counts:
-        path.unlink()
-        raise LinkError(_silence(pictures, wanted))
     return recorder
 
 

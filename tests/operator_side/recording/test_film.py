@@ -308,6 +308,20 @@ def test_recording_without_a_message_is_an_error_and_leaves_no_file(monkeypatch,
     assert list(tmp_path.iterdir()) == []
 
 
+def test_recording_replaces_an_earlier_one_only_if_it_has_messages(monkeypatch, tmp_path: Path) -> None:
+    path, link = tmp_path / "run.mcap", tmp_path / "link.mcap"
+    path.write_bytes(b"earlier")
+    link.symlink_to(path)
+    monkeypatch.setattr("sightline.operator_side.recording.film.PATIENCE_S", 0.01)
+    with pytest.raises(LinkError, match=r"no image from robot 'r1' after 0\.01 s"):
+        record(Talking(), Talking(), link, FRAME, 60.0)
+    assert path.read_bytes() == b"earlier"
+    robot = Talking([status(1)])
+    record(robot, robot, link, FRAME, 0.01)
+    assert [one.message for one in read_recording(path)] == [status(1)]
+    assert link.is_symlink() and set(tmp_path.iterdir()) == {path, link}
+
+
 def test_recording_has_its_length_from_the_first_message_on(tmp_path: Path) -> None:
     robot = Talking([lambda: time.sleep(0.2)], [status(1), lambda: time.sleep(0.03)])
     begin_s = time.monotonic()
