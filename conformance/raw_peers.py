@@ -220,34 +220,40 @@ class RawStopPort:
     """Sends datagrams to the STOP port beside an endpoint. A context manager."""
 
     def __init__(self, endpoint: str) -> None:
-        """Open a socket. Raises LinkError for a host without an address."""
+        """Open a socket for each family of its host, which may listen on one. Raises LinkError without an address."""
         ((host, port),) = stop_addresses([endpoint])
         try:
-            family, kind, _, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
         except OSError as error:
             raise LinkError(f"{endpoint}: {error.strerror}; check the address") from None
-        self._socket = socket.socket(family, kind)
-        self._socket.connect(place)
-        self._socket.setblocking(False)
+        self._sockets: list[socket.socket] = []
+        for family, place in {family: place for family, _, _, _, place in reversed(found)}.items():
+            with suppress(OSError):  # e.g. no IPv6 on this machine
+                self._sockets.append(socket.socket(family, socket.SOCK_DGRAM))
+                self._sockets[-1].setblocking(False)
+                self._sockets[-1].connect(place)
 
     def send(self, data: bytes) -> None:
         """Send a datagram, or drop it where no process listens."""
-        with suppress(OSError):
-            self._socket.send(data)
+        for one in self._sockets:
+            with suppress(OSError):
+                one.send(data)
 
     def received(self) -> list[bytes]:
         """Return the datagrams that have arrived."""
         found: list[bytes] = []
-        with suppress(OSError):  # nothing more, or the report that the port is closed
-            while True:
-                found.append(self._socket.recv(_MAX_HEAD_BYTES))
+        for one in self._sockets:
+            with suppress(OSError):  # nothing more, or the report that the port is closed
+                while True:
+                    found.append(one.recv(_MAX_HEAD_BYTES))
         return found
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_raised: object) -> None:
-        self._socket.close()
+        for one in self._sockets:
+            one.close()
 
 
 def split_url(url: str) -> tuple[bool, str, int]:
