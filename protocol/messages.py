@@ -289,7 +289,8 @@ class Status(WireModel):
     tick_late_max_us: Microseconds = Field(default=0, description="the latest tick of the driver's loop")
     network_restarts: Counter = Field(default=0, description="how often the network process was started again")
     faults: dict[str, Counter] = Field(
-        default={}, description="exceptions and failed writes since the start, by part; the log has the tracebacks"
+        default={},
+        description="exceptions, failed writes and encoder warnings since the start, by part; the log has the details",
     )
     battery_v: Number | None = Field(
         default=None, description="voltage of the battery; null without a battery or a reading of the last 5 s"

@@ -95,7 +95,7 @@ def fault_lines(status: Status) -> Iterator[str]:
     if status.stream.camera_fault:
         yield f"camera    {status.stream.camera_fault}"
     if status.faults:
-        yield f"faults    {counts_text(status.faults)}; the robot's log has the tracebacks"
+        yield f"faults    {counts_text(status.faults)}; the robot's log has the details"
 
 
 def counts_text(counts: Mapping[str, int]) -> str:

@@ -72,7 +72,7 @@ def test_status_shows_the_faults_of_robot_and_vision_service(verbose):
     state = Status(state=State.HOLD, reason="no command", faults={"callback": 1, "drive": 2}, stream=stream)
     lines = _status_block("r1", state, MissionReport(mission="follow", phase="x", faults={"detector": 3}), verbose)
     assert "camera    camera sim gives no image" in lines
-    assert "faults    drive 2, callback 1; the robot's log has the tracebacks" in lines
+    assert "faults    drive 2, callback 1; the robot's log has the details" in lines
     assert "faults    detector 3; the log of the vision service has the tracebacks" in lines
     state = Status(state=State.HOLD, reason="")
     lines = _status_block("r1", state, MissionReport(mission="follow", phase="x"), verbose)
