@@ -13,9 +13,10 @@ _OF_A_FOLDER = ("conftest.py", "__init__.py")
 
 
 def select(tables: Mapping[str, tuple[str, ...]], commit: str) -> tuple[list[str], str | None]:
-    """Select the files that changed, or whose tests, helpers of tests or equivalents changed.
+    """Select the files whose code changed, or that of their tests or helpers of tests, or their equivalents.
 
-    A change to the gate selects every file. So does a missing history: no git, no repository, a shallow clone.
+    Comments and docstrings are not code. A change to the gate selects every file. So does a missing history: no git, no
+    repository, a shallow clone.
 
     Args:
         tables: each file with its test tables, relative to the current folder.
@@ -32,6 +33,7 @@ def select(tables: Mapping[str, tuple[str, ...]], commit: str) -> tuple[list[str
     paths = _changed_paths(base) if base else None
     if base is None or paths is None:
         return list(tables), None
+    paths = {path for path in paths if not path.endswith(".py") or _code_at(base, path) != _code_of(path)}
     if any(path.startswith(f"{GATE}/") and _is_code(path) for path in paths):
         return list(tables), base
     rows = {name[0] for name in _changed_rows(base)} if EQUIVALENTS in paths else set()
@@ -78,6 +80,26 @@ def _changed_paths(base: str) -> set[str] | None:
     tracked = _git("diff", "--name-only", "--no-renames", "--relative", "-z", base, "--")
     untracked = _git("ls-files", "--others", "--exclude-standard", "-z")
     return None if tracked is None or untracked is None else set(f"{tracked}\0{untracked}".split("\0")) - {""}
+
+
+def _code_at(base: str, path: str) -> str | None:
+    return _code(_git("show", f"{base}:./{path}"))
+
+
+def _code_of(path: str) -> str | None:
+    return _code(Path(path).read_text()) if Path(path).is_file() else None
+
+
+def _code(source: str | None) -> str | None:
+    """Return the code without comments and docstrings, None without a file."""
+    if source is None:
+        return None
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(getattr(node, "body", None), list):
+            node.body = [one for one in node.body if not isinstance(getattr(one, "value", None), ast.Constant)
+                         or not isinstance(one, ast.Expr)]
+    return ast.dump(tree)
 
 
 def _changed_rows(base: str) -> set[tuple[str, str, str, str, int]]:

@@ -66,6 +66,8 @@ def repository(tmp_path, monkeypatch):
         ("README.md", "third", []),
         ("tests/mutation/test_mutants.py", "Y = 1\n", []),
         ("a.py", "A = 2\n", ["a.py"]),
+        ("a.py", '"""A text."""\n\nA = 1  # and a comment\n"""The first."""\n', []),
+        ("a.py", "A = 1\nprint('a text')\n", ["a.py"]),
         ("tests/test_b.py", "Y = 1\n", ["b.py"]),
         ("tests/helpers/near.py", "Y = 1\n", ["a.py"]),
         ("tests/helpers/far.py", "X = 2\n", ["a.py", "b.py"]),
