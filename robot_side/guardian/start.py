@@ -107,8 +107,8 @@ def become_guardian(config: RobotConfig, *, restarts: bool) -> GuardianEnd:
     try:
         write_note(setup)
     except OSError as error:
-        _log.warning("robot %s: no note of its drive: %s; its wheels stop seconds later if all its processes die at "
-                     "once", config.robot, error)
+        _log.warning("robot %s: no note of its drive: %s, so its wheels stop a second later if all its processes die "
+                     "at once; see that the folder RUNTIME_DIRECTORY can be written", config.robot, error.strerror)
     for handler in (*logging.getLogger().handlers, sys.stdout, sys.stderr):
         handler.flush()
     signal.pthread_sigmask(signal.SIG_BLOCK, EXIT_SIGNALS)  # until the guardian can forward them
