@@ -70,9 +70,8 @@ class DriverCore:
         )
         self.odometer = Odometer(config.wheels)
         self._encoders = EncoderMonitor(config.wheels)
-        self._speeds = (0.0, 0.0)
         self.doubtful_wheel = ""
-        """What the encoders contradict since the last tick, or empty."""
+        """Contradiction of command and encoders in the last tick, or empty."""
         self.stream = StreamStatus()
         self.tick_late_max_us = 0
         self.network_restarts = 0
@@ -153,16 +152,17 @@ class DriverCore:
         Raises:
             ValueError: an angle is not finite, or its time is in the future.
         """
+        self.doubtful_wheel = ""
         if wheels is not None:
             if (ahead_us := wheels.t_us - now_us) > _AHEAD_US:
                 raise ValueError(f"WheelAngles.t_us is {ahead_us / 1e6:.3g} s ahead; take the robot's clock")
             self.odometer.update(wheels)
-        self.doubtful_wheel = self._encoders.look(self._speeds, wheels, now_us) if wheels is not None else ""
+            speeds = wheel_speeds(self.config.wheels, self.gate.applied)
+            self.doubtful_wheel = self._encoders.look(speeds, wheels, now_us)
         if scan is not None:
             self._on_scan(scan, now_us)
         decision = self.gate.step(now_us)
-        self._speeds = wheel_speeds(self.config.wheels, decision.twist)
-        return self._speeds
+        return wheel_speeds(self.config.wheels, decision.twist)
 
     def motion(self) -> RobotMotion:
         """Return the current motion of the robot, for frame headers."""

@@ -192,6 +192,24 @@ def test_tick_steps_the_gate_and_returns_its_twist_as_wheel_speeds():
     assert core.motion().applied == (0.1, 0.2)
 
 
+def test_tick_compares_the_encoders_with_the_speeds_of_the_tick_before():
+    core = armed(core_of(**AUTO))
+    assert core.doubtful_wheel == ""
+    doubts = []
+    for step in range(1, 250):
+        now_us = NOW_US + step * 20_000
+        core.on_issued(9 + step, now_us, 9 + step)
+        core.on_twist(twist(number=9 + step, seq=9 + step, t_us=now_us), now_us)
+        core.tick(now_us, WheelAngles(0.0, 2.4 * step * 0.02, now_us), None)
+        doubts.append(core.doubtful_wheel)
+    found = [doubt for doubt in doubts if doubt]
+    assert found[0].startswith("left wheel turned 0 rad where ") and len(found) == 1
+    core.tick(now_us + 20_000, WheelAngles(0.0, 1000.0, now_us + 20_000), None)
+    assert core.doubtful_wheel.startswith("right wheel jumped by ")
+    core.tick(now_us + 40_000, None, None)
+    assert core.doubtful_wheel == ""
+
+
 def test_tick_reads_the_wheels_and_the_motion_is_bounded():
     core = core_of()
     assert core.motion() == RobotMotion() and core.at_rest
