@@ -120,7 +120,9 @@ def _slow_logged(config: RobotConfig, device: str) -> Iterator[None]:
     """Log the name of a device that takes long to open: until all are open a robot is silent."""
     waiting = threading.Timer(_SLOW_S, _log.info, ["robot %s: waiting for the %s to open", config.robot, device])
     waiting.daemon = True
+    usual_bytes = threading.stack_size(_STACK_BYTES)
     waiting.start()
+    threading.stack_size(usual_bytes)
     try:
         yield
     finally:
