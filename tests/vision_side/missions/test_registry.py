@@ -233,9 +233,10 @@ SIZE = st.floats(min_value=0, exclude_min=True, allow_infinity=False)
 @example(box=(1e308, 0.0, 1.7e308, 1e308), circle=None, size=1.0)
 @example(box=(1e-320, 0.0, 2e-320, 1.0), circle=None, size=1.0)
 @example(box=(0.0, 0.0, 1.0, 1.0), circle=1e308, size=1e308)
+@example(box=(0.0, 0.0, 0.0, 0.0), circle=0.0, size=1.0)
 @given(box=st.tuples(FAR, FAR, FAR, FAR), circle=st.none() | FAR, size=SIZE)
 def test_legacy_controllers_give_a_twist_for_any_box(box, circle, size):
-    one = Detection(*box, 0.9, "ball", circle and Circle(circle, 0.0, size))
+    one = Detection(*box, 0.9, "ball", None if circle is None else Circle(circle, 0.0, size))
     for kind in ("band", "pixel-p", "pixel-pi"):
         law = mission(kind, **({"min_area_px": 0} if kind == "pixel-pi" else {}))
         assert all(abs(speed) < 1e9 for _ in range(2) for speed in twist_of(law, view(one)))
