@@ -91,9 +91,10 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
         with _slow_logged(config, f"drive {config.motors.kind}"):
             drive: Drive = LostDrive(config.motors) if is_restart else DRIVES.build(config.motors)
         ending.callback(_close, "drive", drive)
-        with _slow_logged(config, f"range sensor {config.ranging.kind if config.ranging else ''}"):
-            ranges = RANGE_SENSORS.build(config.ranging) if config.ranging else None
-        if ranges is not None:
+        ranges = None
+        if config.ranging:
+            with _slow_logged(config, f"range sensor {config.ranging.kind}"):
+                ranges = RANGE_SENSORS.build(config.ranging)
             ending.callback(_close, "range sensor", ranges)
         threading.stack_size(_PLUGIN_STACK_BYTES)
         reader = BatteryReader(BATTERIES.build(config.battery)) if config.battery else None
