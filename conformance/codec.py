@@ -162,8 +162,7 @@ class CodecProgram:
 
     def finish(self) -> None:
         """Close its input, and wait for its end. Raises ProgramError unless it ends well and in time."""
-        assert self._process.stdin is not None
-        self._process.stdin.close()
+        self._close_input()
         try:
             code = self._process.wait(END_S)
         except subprocess.TimeoutExpired:
@@ -178,6 +177,7 @@ class CodecProgram:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
+        self._close_input()
 
     # --- pipes -------------------------------------------------------------------------------------------------------
 
@@ -189,6 +189,11 @@ class CodecProgram:
             self._process.stdin.flush()
         except (OSError, ValueError):
             return
+
+    def _close_input(self) -> None:
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):  # questions that a program did not read before its end
+            self._process.stdin.close()
 
     def _listen(self, stderr: IO[bytes]) -> None:
         """Read stderr on a thread, and keep the end of it."""

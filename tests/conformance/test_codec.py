@@ -16,6 +16,7 @@ from sightline.conformance.codec import (
     END,
     MAX_ANSWER_BYTES,
     VECTORS,
+    CodecProgram,
     ProgramError,
     Question,
     codec_cases,
@@ -131,6 +132,14 @@ def test_what_a_program_does_not_know_is_not_applicable():
 def test_a_program_that_cannot_be_started_is_a_bad_command():
     with pytest.raises(ConfigError, match="cannot start 'no-such-program': No such file"):
         run_codec(["no-such-program"], FEW)
+
+
+@pytest.mark.parametrize("size", [1, 5_000, 500_000])
+def test_a_program_may_end_before_it_has_read_every_question(size):
+    question = Question("text", {"text": "x" * size}, {})
+    with CodecProgram(["sh", "-c", """echo '{"id": 1, "ok": {}}'"""]) as program:
+        assert [answered for answered, _ in program.request(iter([question]))] == [question]
+        program.finish()
 
 
 def test_nothing_of_a_program_is_left(tmp_path):
