@@ -90,7 +90,7 @@ def test_watch_redraws_in_place_with_colors_unless_no_color(endpoint, monkeypatc
         assert ("\x1b[31mSTOPPED" in terminal.text()) is colored
         terminal.types("\x03")
         assert terminal.process.wait(5) == 130
-        assert terminal.text().endswith("\x1b[?25h"), "the cursor is visible again"
+        assert until(lambda: terminal.text().endswith("\x1b[?25h"), 5), "the cursor is visible again"
     finally:
         terminal.close()
 
