@@ -33,6 +33,8 @@ from sightline.evaluation.score.figures import Score
 from sightline.sim.scenario import load_scenario, scenario_names
 from tests.evaluation.score.test_figures import truth
 
+pytestmark = pytest.mark.computes
+
 SEEDS = (901, 902)
 GOOD = Score(
     acquired_s=1.0, found_s=0.0, bearing_rms_deg=0.2, distance_rms_m=0.01, lost_percent=0.0, wall_contacts=0,

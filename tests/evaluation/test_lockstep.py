@@ -8,6 +8,8 @@ from sightline.protocol.messages import State
 from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario
 
+pytestmark = pytest.mark.computes
+
 ROBOT = load_robot("raspberry")
 
 

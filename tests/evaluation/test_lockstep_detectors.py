@@ -19,6 +19,8 @@ from sightline.evaluation.score.figures import score
 from sightline.sim.scenario import load_scenario
 from sightline.vision_side.config import DetectorConfig, HsvConfig
 
+pytestmark = pytest.mark.computes
+
 WAITING = load_scenario(str(Path(__file__).parent.parent.parent / "examples" / "ball-boxes.toml"))
 SCENARIO = WAITING.model_copy(update={"target": WAITING.target.model_copy(update={"waits_s": 0.0})})
 """In virtual time the ball need not wait for processes."""

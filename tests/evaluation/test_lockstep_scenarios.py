@@ -12,6 +12,8 @@ from sightline.protocol.messages import State
 from sightline.sim.scenario import load_scenario, scenario_names
 from sightline.sim.truth import Truth
 
+pytestmark = pytest.mark.computes
+
 BASICS = {"static", "circle", "eight", "pushed", "behind", "walls"}
 """Those that test_lockstep.py holds against all their bounds."""
 

@@ -9,6 +9,8 @@ import pytest
 
 from tests.exploration.planted import bugs
 
+pytestmark = pytest.mark.computes
+
 QUICK = ("two drivers of equal rank", "the gate forgets STOP over a restart", "a repeated image counts as new")
 
 

@@ -7,6 +7,8 @@ import pytest
 from sightline.protocol import proof as proof_module
 from sightline.protocol.proof import ELEMENT_BYTES, MAX_LOST, NO_PROOF, Proof, ProofChain, continues, session_digest
 
+pytestmark = pytest.mark.computes
+
 
 def chain(seed=1):
     return ProofChain(Random(seed).randbytes)

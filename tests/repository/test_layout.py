@@ -307,6 +307,15 @@ def test_every_thread_has_a_name():
     none_of(wrong)
 
 
+def test_no_test_that_runs_at_low_priority_knows_a_clock():
+    marked = [path for path in (ROOT / "tests").rglob("test_*.py") if "pytestmark = pytest.mark.computes\n" in source(path)]
+    clocks = SHELL_MODULES - {"logging", "subprocess"}
+    assert len(marked) > 20
+    none_of(f"{path.relative_to(ROOT)} imports {name}" for path in marked
+            for name in {alias.name for node in nodes(path, ast.Import) for alias in node.names}
+            | {node.module for node in nodes(path, ast.ImportFrom)} if name and name.partition(".")[0] in clocks)
+
+
 # --- nothing stale -------------------------------------------------------------------------------------------------
 
 PAGES = sorted(chain((ROOT / "docs").rglob("*.md"), ROOT.glob("*.md"), (ROOT / "examples").rglob("*.md"),

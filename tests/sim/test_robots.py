@@ -21,6 +21,8 @@ from sightline.sim.scenario import Start, Wall, load_scenario
 from sightline.sim.world.world import World
 from tests.fixtures.sim import empty, robot_names
 
+pytestmark = pytest.mark.computes
+
 ROBOTS = [name for name in robot_names() if name != "chaser-small"]  # it differs in nothing that these tests look at
 
 

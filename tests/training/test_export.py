@@ -40,6 +40,8 @@ from sightline.training.schedule import SceneRange, Training
 from tests.fixtures.vision.onnx import brightness_model
 from tests.training.fixture import weights
 
+pytestmark = pytest.mark.computes
+
 BALL = LabelledBox("ball", (100.0, 60.0, 141.0, 99.0), 1.0)
 
 

@@ -31,6 +31,8 @@ from sightline.training.schedule import Training
 from sightline.vision_side.detect.onnx.detector import SHIPPED
 from tests.training.fixture import weights
 
+pytestmark = pytest.mark.computes
+
 
 def scenes(count=4):
     """Discs on grey: enough to learn from in a few steps."""

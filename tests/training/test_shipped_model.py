@@ -19,6 +19,8 @@ from sightline.training.network import INPUT_PX
 from sightline.vision_side.detect.onnx.detector import SHIPPED
 from sightline.vision_side.detect.onnx.engine import open_engine
 
+pytestmark = pytest.mark.computes
+
 CARD = SHIPPED.with_suffix(".md").read_text("utf-8")
 SEED = SCORED_FROM + 40_000  # other scenes than those of the card
 

@@ -25,6 +25,8 @@ from sightline.vision_side.detect.onnx.engine import open_engine
 from sightline.vision_side.detect.registry import build_detector
 from tests.training.fixture import weights
 
+pytestmark = pytest.mark.computes
+
 
 @contextmanager
 def told(counts, total, what):

@@ -28,6 +28,8 @@ from tests.fixtures.vision.vision import (
     still,
 )
 
+pytestmark = pytest.mark.computes
+
 SEEDS = (1, 2, 3, 4, 5, 6)
 
 

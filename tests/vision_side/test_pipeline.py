@@ -25,6 +25,8 @@ from sightline.vision_side.pipeline import Frame, FrameLoss, Observation, Pipeli
 from sightline.vision_side.tracking.track import from_odometry
 from tests.fixtures.vision.vision import Rig, ball_about_lens, camera, eight, jpeg_of, scene
 
+pytestmark = pytest.mark.computes
+
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2, shaded=True))
 EMPTY = jpeg_of(np.full((240, 320, 3), 140, np.uint8))

@@ -20,6 +20,8 @@ from tests.conformance.robot.broken import motion as broken_motion
 from tests.conformance.robot.broken.breaking import fields_of
 from tests.conformance.robot.reference import virtual_robot
 
+pytestmark = pytest.mark.computes
+
 VIRTUAL = [case for case in CASES if not case.real]
 NAMES = [case.id for case in VIRTUAL]
 CASES_BY_ID = dict(zip(NAMES, VIRTUAL, strict=True))

@@ -22,6 +22,8 @@ from tests.conformance.vision import broken_steering as vision_broken_steering
 from tests.conformance.vision.broken import BROKEN, BrokenVision
 from tests.conformance.vision.fixture import VirtualVision, virtual_bench
 
+pytestmark = pytest.mark.computes
+
 VIRTUAL = [case for case in CASES if not case.real]
 
 

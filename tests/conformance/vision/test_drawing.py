@@ -24,6 +24,8 @@ from sightline.protocol.jpeg import read_jpeg_size
 from tests.conformance.vision import drawing as vision_pictures
 from tests.conformance.vision.drawing import DRAWINGS, Drawing, encode_jpeg
 
+pytestmark = pytest.mark.computes
+
 
 def decoded(jpeg):
     """Decode an image by OpenCV to Y, Cb, Cr."""

@@ -20,6 +20,8 @@ from sightline.sim.scenes.plan import plan_scene
 from sightline.training.shipping import ball_threshold, label_threshold
 from sightline.vision_side.detect.port import Circle, Detection, overlap
 
+pytestmark = pytest.mark.computes
+
 BALL = LabelledBox("ball", (100.0, 100.0, 140.0, 140.0), 1.0, (100.0, 100.0, 140.0, 140.0))
 OTHER = (200.0, 100.0, 240.0, 160.0)
 

@@ -23,6 +23,8 @@ from sightline.operator_side.cli import app as cli
 from sightline.sim.scenes.model import COLUMNS
 from sightline.vision_side.detect.port import Detection, DetectionResult
 
+pytestmark = pytest.mark.computes
+
 EACH = 1
 
 

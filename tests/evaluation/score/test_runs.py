@@ -19,6 +19,8 @@ from sightline.operator_side.cli import app as cli
 from sightline.protocol.errors import ConfigError
 from sightline.sim.scenario import load_scenario
 
+pytestmark = pytest.mark.computes
+
 GOOD = Score(
     acquired_s=1.0, found_s=0.0, bearing_rms_deg=0.2, distance_rms_m=0.01, lost_percent=0.0, wall_contacts=0,
     travelled_m=1.0, seconds=5.0,

@@ -32,6 +32,8 @@ from sightline.robot_side.ports import Ranges, WheelAngles
 from sightline.sim.scenario import load_scenario, scenario_names
 from sightline.vision_side.detect.port import Circle, Detection, DetectionResult
 
+pytestmark = pytest.mark.computes
+
 BALL = Detection(100.0, 50.0, 140.0, 90.0, 0.9, "target", Circle(120.0, 70.0, 20.0), np.array([[100.0, 70.0]]))
 NEVER_USED_SEEDS = range(7901, 7907)
 

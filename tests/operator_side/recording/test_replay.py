@@ -17,6 +17,8 @@ from tests.fixtures.vision.vision import camera, jpeg_of, scene
 from tests.operator_side.recording.test_recorder import record
 from tests.vision_side.serving.test_mission_channel import FRAME_US, GOTO, MODEL, Bench, scan
 
+pytestmark = pytest.mark.computes
+
 
 def scanned(bench, count):
     """Frames with a scan before every third, as a robot sends them."""

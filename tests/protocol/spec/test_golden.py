@@ -17,6 +17,8 @@ from sightline.protocol.spec.framing_cases import FRAMING_CASES, READERS, framin
 from sightline.protocol.spec.message_cases import CASES, MessageCase
 from sightline.protocol.text import MAX_TWIST_BYTES
 
+pytestmark = pytest.mark.computes
+
 VECTORS = Path(schema.__file__).parent.parent / "vectors"
 README = (Path(schema.__file__).parent.parent / "README.md").read_text("utf-8")
 

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from sightline.protocol.channels import FRAME, STATUS, TWIST, Direction
 from sightline.protocol.transports.memory import MAX_IN_FLIGHT, Leg, MemoryNetwork
 
+pytestmark = pytest.mark.computes
+
 FRAME_US = 33_333
 
 

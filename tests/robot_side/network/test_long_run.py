@@ -16,6 +16,8 @@ from sightline.robot_side.network.core import NetworkCore
 from sightline.robot_side.ports import Picture, WheelAngles
 from sightline.robot_side.safety.limits import STOP_TIME_BOUND_US, SafetyConfig
 
+pytestmark = pytest.mark.computes
+
 TICK_US, FRAME_US = 20_000, 33_333
 OUTAGE_S = 2
 

@@ -13,6 +13,8 @@ from sightline.robot_side.network.stream import Stream, StreamConfig
 from sightline.robot_side.safety.limits import TICK_US, SafetyConfig
 from tests.robot_side.network.fixture import VISION, Camera, Leg, run
 
+pytestmark = pytest.mark.computes
+
 SEEDS = [1, 2, 3]
 
 

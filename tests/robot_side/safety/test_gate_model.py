@@ -11,6 +11,8 @@ from sightline.robot_side.safety import gate as safety
 from sightline.robot_side.safety.states import TRANSITIONS
 from tests.fixtures.safety import HUMAN, MS, OTHER, VISION, Rig
 
+pytestmark = pytest.mark.computes
+
 RANK = {"guest": 0, "vision": 1, "teleop": 2}
 DRIVERS = [("vision", VISION), ("vision", OTHER), ("teleop", HUMAN), ("teleop", OTHER), ("guest", OTHER)]
 AGES_MS = [0, 0, 0, 20, 149.999, 150, 150.001, 200, 250, 399.999, 400, 400.001, 500, -0.001]

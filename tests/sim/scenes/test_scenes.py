@@ -46,6 +46,8 @@ from sightline.sim.scenes.textures import (
 from tests.fixtures.sim import use_pybullet_without_numpy
 from tests.sim.scenes import scored_scenes
 
+pytestmark = pytest.mark.computes
+
 ALL = [*COLUMNS.values(), THINGS, TRAINED_COLUMN]
 
 

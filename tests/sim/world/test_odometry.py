@@ -14,6 +14,8 @@ from sightline.sim.scenario import Start, load_scenario
 from sightline.sim.world.world import STEP_US, World
 from tests.fixtures.sim import robot_names
 
+pytestmark = pytest.mark.computes
+
 TICK_STEPS = 5  # 50 Hz, as the driver reads its encoders
 SHARE = 2 / 3
 WAY_M, TURNS = 10.0, 10

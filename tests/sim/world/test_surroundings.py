@@ -33,6 +33,8 @@ from sightline.sim.world.view import Scenery
 from sightline.sim.world.world import World
 from tests.fixtures.sim import robot_with, seen_at
 
+pytestmark = pytest.mark.computes
+
 
 def with_look(name: str, **options) -> Scenario:
     return load_scenario(name).model_copy(update={"look": Look(noise=0.0, jpeg_quality=100, **options)})

@@ -14,6 +14,8 @@ from sightline.sim.scenario import OnPath, PathLeg, Start, Wall, load_scenario, 
 from sightline.sim.world.world import STEP_US, World
 from tests.fixtures.sim import RADIUS_M, TRACK_M, DeadReckoning, empty, robot_with, seen_at
 
+pytestmark = pytest.mark.computes
+
 
 def test_ten_metres_straight_odometry_errs_less_than_a_thousandth():
     with World(empty(), robot_with(), 3) as world:

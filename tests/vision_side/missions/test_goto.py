@@ -15,6 +15,8 @@ from sightline.vision_side.missions.port import Plan
 from tests.fixtures.vision.course import Course, Drive, Eyes, Lidar, Row, Segment
 from tests.fixtures.vision.vision import camera
 
+pytestmark = pytest.mark.computes
+
 THYMIO = Footprint(front_m=0.08, rear_m=0.03, half_width_m=0.0635)
 CLEAR_M = 0.10
 

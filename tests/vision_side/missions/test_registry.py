@@ -21,6 +21,8 @@ from sightline.vision_side.missions.registry import REGISTRY, configured_mission
 from tests.contracts.missions import CAMERA, check_mission
 from tests.fixtures.plugins import with_entries
 
+pytestmark = pytest.mark.computes
+
 CONFIG = VisionConfig()
 ROOT = Path(__file__).parent.parent.parent.parent
 WAYPOINTS = {"waypoints": [[1.0, 0.5], [0.0, -1.0]]}

@@ -25,6 +25,8 @@ from sightline.vision_side.missions.traffic_light import StopConfig, StopLine, T
 from tests.fixtures.vision.course import Course, Drive, Row
 from tests.fixtures.vision.lane import BLOCK_M, LENS, LaneWorld
 
+pytestmark = pytest.mark.computes
+
 LOOKS = ("plain", "dim", "bright", "warm", "cold", "desaturated", "quality30")
 RASPBERRY = Footprint(front_m=0.07, rear_m=0.10, half_width_m=0.09)
 CYCLE = (("red", 5.0), ("green", 5.0), ("yellow", 2.0))

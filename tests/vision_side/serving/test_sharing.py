@@ -13,6 +13,8 @@ from sightline.protocol.transports.tokens import DriverToken, RobotToken, Vision
 from sightline.vision_side.serving.assignment import assign, ranked
 from sightline.vision_side.serving.sharing import Sharing, SharingPart
 
+pytestmark = pytest.mark.computes
+
 MS = 1_000
 STEP_US, STATUS_US, FRAME_US, SILENT_US, LEASE_US = 10 * MS, 100 * MS, 60 * MS, 400 * MS, 1_000 * MS
 
