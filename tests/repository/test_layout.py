@@ -308,7 +308,8 @@ def test_every_thread_has_a_name():
 
 
 def test_no_test_that_runs_at_low_priority_knows_a_clock():
-    marked = [path for path in (ROOT / "tests").rglob("test_*.py") if "pytestmark = pytest.mark.computes\n" in source(path)]
+    mark = "pytestmark = pytest.mark.computes\n"
+    marked = [path for path in (ROOT / "tests").rglob("test_*.py") if mark in source(path)]
     clocks = SHELL_MODULES - {"logging", "subprocess"}
     assert len(marked) > 20
     none_of(f"{path.relative_to(ROOT)} imports {name}" for path in marked

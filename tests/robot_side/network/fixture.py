@@ -1,6 +1,7 @@
 """A thin, far, lossy or broken link in virtual time, with TCP's habits, for the stream: nothing here waits."""
 
 import heapq
+import math
 from dataclasses import dataclass, field
 from itertools import pairwise
 from random import Random
@@ -55,6 +56,11 @@ class Leg:
             return None
         packets = max(1, -(-size_bytes // PACKET_BYTES))
         at_us = max(float(now_us), self.free_us)
+        if not (rate or self.steps or self.loss or self.burst[0] or self.in_burst):
+            at_us = self.after_outage(at_us)
+            self.arrived_us = max(self.arrived_us, at_us + self.delay_us)
+            self.random.getrandbits(2 * 64 * packets)  # what `recovery_us` draws, so that the same messages are gone
+            packets = 0  # they all arrive then
         for number in range(packets):
             at_us = self.after_outage(at_us)
             rate = self.rate(at_us)
@@ -162,7 +168,8 @@ def run(out, back, *, seconds=20.0, compute_us=3_000, camera=None, config=None, 
                     push(at + slot_us, "answer", item)
             push(state["busy"], "look", None)
 
-    for tick in range(round(seconds * 1e6 / 1000)):
+    ticks, tick = round(seconds * 1e6 / 1000), 0
+    while tick < ticks:
         now = tick * 1000
         while events and events[0][0] <= now:
             at, _, kind, item = heapq.heappop(events)
@@ -181,5 +188,9 @@ def run(out, back, *, seconds=20.0, compute_us=3_000, camera=None, config=None, 
             if at is not None:
                 push(at, "arrive", (state["seq"], now, size))
             state["seq"] += 1
-        windows.append(stream.window)
+        # Nothing changes until the next message or picture.
+        next_us = min((now // FRAME_US + 1) * FRAME_US, events[0][0] if events else math.inf)
+        after = min(ticks, max(tick + 1, math.ceil(next_us / 1000)))
+        windows += [stream.window] * (after - tick)
+        tick = after
     return Course(answers, stream, windows, state["captures"])
