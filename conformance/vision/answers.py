@@ -28,8 +28,8 @@ _LAST_US: Final = 200_000
 _FOUR_DECIMALS: Final = re.compile(rb"[+-]?[0-9]+\.[0-9]{4}\|[+-]?[0-9]+\.[0-9]{4}")
 
 
-def _sample(bench: Bench, junk: int = 0) -> list[VisionAnswer]:
-    """Return the answers to six views, with a target at the side, ahead and absent, and to images that are invalid."""
+def _sample(bench: Bench, junk: int = 1) -> list[VisionAnswer]:
+    """Return the answers to six views, with a target at the side, ahead and absent, and acks of invalid images."""
     robot = RobotPlayed(bench)
     for name in ("left", "left", "centre", "centre", "right", "absent"):
         robot.is_driven(robot.frame(name))
@@ -76,7 +76,7 @@ def one_answer(bench: Bench, robot: RobotPlayed) -> None:
 def empty_ack(bench: Bench) -> None:
     """An ack has no payload."""
     before = bench.dropped_here[OVERSIZE]
-    _sample(bench)
+    _sample(bench, junk=0)
     bench.need(bench.dropped_here[OVERSIZE] == before, "its twists are too large already")
     _sample(bench, junk=3)
     bench.expect(bench.dropped_here[OVERSIZE] == before, "an answer to what is not picture was over its channel's size")
@@ -214,6 +214,14 @@ def no_infinite_numbers(bench: Bench) -> None:
     for answer in _sample(bench):
         header = answer.received.message.header
         bench.expect(b"NaN" not in header and b"Infinity" not in header, f"{header[:200]!r}")
+
+
+@SUITE.must("V-HEAD-11", "18.6 What an answer went by")
+def names_what_came(bench: Bench) -> None:
+    """An answer names a `scan` and a `mission` only of this session of the robot: here none came."""
+    for answer in _sample(bench):
+        named = {name: value for name in ("scan", "mission") if (value := answer.fields.get(name)) is not None}
+        bench.expect(not named, f"it names {named}")
 
 
 # --- grammar of twists -----------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ import itertools
 import re
 from collections.abc import Callable
 from functools import partial
+from statistics import median
 from typing import Any, Final
 
 from sightline.conformance.case import Bench, Level, Received, Suite, itself
@@ -17,10 +18,11 @@ from sightline.conformance.vision.fixture import (
     met,
     read_answer,
 )
-from sightline.conformance.vision.images import png
+from sightline.conformance.vision.images import CAMERA as LENS
+from sightline.conformance.vision.images import LARGE_CAMERA, commented, gray, picture, png
 from sightline.protocol.channels import SCAN, STATUS, TWIST, Channel
 from sightline.protocol.codec import encode
-from sightline.protocol.messages import MAX_INTEGER
+from sightline.protocol.messages import MAX_INTEGER, CameraModel
 from sightline.protocol.proof import MAX_LOST, Proof, continues
 from sightline.protocol.spec.message_cases import packed
 
@@ -35,14 +37,20 @@ _SEQ_LEAP: Final = 100_000
 _OTHER_SESSION: Final = "fffffff0"
 _MAX_FIRST_SEQ: Final = 2**32
 _MAX_SEQ_STEP: Final = 2**20
+_MEASURED: Final = 5
+_MEASURABLE_US: Final = 10_000
+"""A smaller difference between two medians may come from the machine."""
+_COMMENTS: Final = 3
 _RAYS: Final[dict[str, Any]] = {
     "angle_min_rad": -1.0, "angle_increment_rad": 0.5, "range_min_m": 0.1, "range_max_m": 8.0,
 }  # fmt: skip
 
 
 def _cited(bench: Bench) -> list[tuple[Sent, VisionAnswer]]:
+    """Return six frames with their twists, and an invalid image with its ack, if there is one (3.3)."""
     robot = RobotPlayed(bench)
-    sent = robot.film("left", 6, 100_000)
+    sent = [*robot.film("left", 6, 100_000), robot.frame(jpeg=png())]
+    robot.is_answered(sent[-1])
     pairs = [(one, answer) for one in sent for answer in robot.answers_to(one)]
     if not pairs:
         robot.need_nothing_dropped()
@@ -158,6 +166,36 @@ def compute_time_is_true(bench: Bench) -> None:
                      f"it reports {compute_us} us, and its answer took {took_us} us in all")
 
 
+@SUITE.must("V-CAUS-22", "2.8 Fields", met)
+def compute_time_is_in_microseconds(bench: Bench, _robot: RobotPlayed) -> None:
+    """`compute_us` includes at least half of the time by which a large image is answered later than a small one."""
+    large = gray(LARGE_CAMERA)
+    small = picture("absent")
+    padded = commented(small, _COMMENTS, (len(large) - len(small)) // _COMMENTS)  # as long on the link as the large one
+    (took_us, computed_us), (longer_us, more_us) = (
+        _times_us(bench, *one) for one in ((LENS, padded), (LARGE_CAMERA, large)))
+    later_us = longer_us - took_us
+    bench.expect(later_us < _MEASURABLE_US or more_us - computed_us >= later_us / 2,
+                 f"a large image is answered {later_us:.0f} us later than a small one, and `compute_us` rises from "
+                 f"{computed_us:.0f} to {more_us:.0f}")
+
+
+def _times_us(bench: Bench, camera: CameraModel, jpeg: bytes) -> tuple[float, float]:
+    """Return the median time until an answer, and its median `compute_us`. The first images are not measured."""
+    robot = RobotPlayed(bench, camera=camera)
+    pairs: list[tuple[int, int]] = []
+    for _ in range(2 * _MEASURED):
+        sent = robot.frame(jpeg=jpeg)
+        if robot.is_answered(sent):
+            answer = robot.answers_to(sent)[0]
+            pairs.append((answer.received.at_us - sent.at_us, answer.fields.get("compute_us", 0)))
+    robot.stop()
+    bench.need(len(pairs) >= _MEASURED, f"it does not answer images of {camera.width_px}x{camera.height_px} in time")
+    bench.need(all(isinstance(one, int) and one for _, one in pairs), "it states no computing time (V-HEAD-09)")
+    took_us, computed_us = (median(column) for column in zip(*pairs[-_MEASURED:], strict=True))
+    return took_us, computed_us
+
+
 @SUITE.must("V-CAUS-13", "2.5 Session and sequence", met)
 def gaps_are_fine(_bench: Bench, robot: RobotPlayed) -> None:
     """`seq` may leap by some hundreds: frames that were never sent are not missed."""
@@ -224,8 +262,9 @@ def _rises(bench: Bench, answers: list[VisionAnswer], what: str) -> None:
 
 @SUITE.must("V-SEQ-01", "2.5 Session and sequence", met)
 def session_stays(bench: Bench, robot: RobotPlayed) -> None:
-    """Its session is one and the same from answer to answer."""
+    """Its session is one and the same from answer to answer, be it a twist or an ack."""
     robot.film("left", 40)
+    robot.is_answered(robot.frame(jpeg=png()))
     sessions = {str(one.fields.get("session")) for one in robot.answers() if one.fields}
     bench.expect(len(sessions) < 2, f"it answered as {', '.join(sorted(sessions)[:4])}")
 

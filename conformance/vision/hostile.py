@@ -60,6 +60,13 @@ HEADERS: Final[dict[str, tuple[str, str, Callable[[Fields], bytes]]]] = {
     "V-HOST-23": ("`null` where no null belongs", _JSON, lambda it: packed(it | {"moving": None})),
     "V-HOST-24": ("Brackets in brackets, 150 deep, and one left open", _JSON,
                   lambda it: packed(it)[:-1] + b',"x":' + b"[" * 150 + b"]" * 149 + b"}"),
+    "V-HOST-25": ("A version that is `true`", _VERSION, lambda it: packed(it | {"v": True})),
+    "V-HOST-26": ("A version 1.0", _VERSION, lambda it: packed(it | {"v": 1.0})),
+    "V-HOST-27": ("An `applied` of one number", _FIELDS, lambda it: packed(it | {"applied": [0]})),
+    "V-HOST-28": ("A negative `latency_us`", _FIELDS, lambda it: packed(it | {"latency_us": -1})),
+    "V-HOST-29": ("A `moving` that is a text", _JSON, lambda it: packed(it | {"moving": "0,0"})),
+    "V-HOST-30": ("A `seq` with an exponent", _NUMBERS,
+                  lambda it: packed(it).replace(b'"seq":%d' % it["seq"], b'"seq":%de0' % it["seq"])),
 }
 """Headers that make a frame invalid: title, clause, header."""
 
@@ -145,6 +152,9 @@ CAMERAS: Final[dict[str, tuple[str, str, bytes, Fields]]] = {
     "V-HOST-46": ("A camera model that is not a number", _CAMERA, packed(_SMALL | {"cx_px": float("nan")}), {}),
     "V-HOST-47": ("A camera model of version 2", _VERSION, packed(_SMALL), {"v": 2}),
     "V-HOST-48": ("A camera model with a negative `seq` in its header", _NUMBERS, packed(_SMALL), {"seq": -1}),
+    "V-HOST-49": ("A camera model whose `fy_px` is zero", _CAMERA, packed(_SMALL | {"fy_px": 0}), {}),
+    "V-HOST-50": ("A camera model with a text for the place of the lens", _CAMERA, packed(_SMALL | {"x_m": "0"}), {}),
+    "V-HOST-52": ("A camera model whose `calibrated` is a number", _CAMERA, packed(_SMALL | {"calibrated": 1}), {}),
 }
 """Camera models that must be rejected, since images would not fit: title, clause, payload, changes of the header."""
 
@@ -230,6 +240,9 @@ REJECTED: Final[dict[str, tuple[str, Callable[[], bytes]]]] = {
     "V-LIM-16": ("A text", lambda: b"0.5000|0.0000"),
     "V-LIM-17": ("A JPEG that claims the right size and has no pixels", lambda: claiming(320, 240)),
     "V-LIM-20": ("A JPEG with a segment of length zero", lambda: b"\xff\xd8\xff\xfe\x00\x00" + picture("left")[2:]),
+    "V-LIM-22": ("A JPEG with 64 fill bytes before its frame header", lambda: filled(picture("left"), 64)),
+    "V-LIM-23": ("A JPEG with 64 markers without a length before its frame header",
+                 lambda: picture("left")[:2] + b"\xff\x01" * 64 + picture("left")[2:]),
     "V-LIM-19": ("A picture of another size than the camera's", lambda: picture("left_half")),
     "V-LIM-18": ("A JPEG of zeros after its start", lambda: b"\xff\xd8" + bytes(4_000)),
 }

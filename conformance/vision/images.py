@@ -25,6 +25,23 @@ def picture(name: str) -> bytes:
     return {path.stem: path for path in FOLDER.glob("*.jpg")}[name].read_bytes()
 
 
+LARGE_CAMERA: Final = CAMERA.model_copy(update={"width_px": 1920, "height_px": 1080, "fx_px": 1144.2,
+                                                "fy_px": 1144.2, "cx_px": 960.0, "cy_px": 540.0})
+_BLOCK_BITS: Final = 12
+"""Bits of a gray block in the kit's files: 4 for the DC code of no difference, 8 for the end of the block, all zero."""
+
+
+@cache
+def gray(camera: CameraModel) -> bytes:
+    """Return a gray JPEG of the size of `camera`: the tables of another one, then zeros for each block."""
+    jpeg = picture("absent")
+    frame, scan = jpeg.find(b"\xff\xc0"), jpeg.find(b"\xff\xda")
+    head = bytearray(jpeg[: scan + 2 + int.from_bytes(jpeg[scan + 2 : scan + 4])])
+    head[frame + 5 : frame + 9] = camera.height_px.to_bytes(2) + camera.width_px.to_bytes(2)
+    blocks = -(-camera.width_px // 8) * -(-camera.height_px // 8) * head[frame + 9]
+    return bytes(head) + bytes(-(-blocks * _BLOCK_BITS // 8)) + b"\xff\xd9"
+
+
 # --- damaged images ---------------------------------------------------------------------------------------------------
 
 

@@ -34,6 +34,7 @@ rewriting("V-HEAD-05", "counts in texts", lambda it: {"seq": str(it["seq"])})
 rewriting("V-HEAD-08", "computes in less than no time", lambda it: {"compute_us": -1})
 rewriting("V-HEAD-09", "does not state its computing time", lambda it: {"compute_us": 0})
 rewriting("V-HEAD-10", "is NaN sure", lambda it: {"sure": float("nan")})
+rewriting("V-HEAD-11", "names a scan that never came", lambda it: {"scan": it["seq"]})
 rewriting("V-GRAM-01", "ends a twist with a newline", text=lambda text: text + b"\n")
 rewriting("V-GRAM-03", "writes five decimals", text=lambda text: text.replace(b"|", b"0|") + b"0")
 rewriting("V-GRAM-04", "writes -0", text=lambda text: b"-" + text if text.startswith(b"0.0000") else text)
@@ -44,6 +45,28 @@ echoing("V-CAUS-03", "cites `seq` as a real number", lambda it: {"seq": float(it
 echoing("V-CAUS-04", "rounds times to milliseconds",
         lambda it: {"t_us": it["t_us"] if it["t_us"] > 2**50 else it["t_us"] // 1000 * 1000})
 echoing("V-FRAM-19", "keeps 32 bits of `seq`", lambda it: {"seq": it["seq"] % (2**32 if it["seq"] > 2**40 else 2**53)})
+
+
+@breaks("V-CAUS-22", "states its computing time in milliseconds")
+class Milliseconds(BrokenVision):
+    """Takes 60 ms for a large image."""
+
+    later = large = None
+
+    def hears(self, header, jpeg):
+        self.large = len(jpeg) > 100_000 and jpeg.count(b"\xff\xfe") == 0
+        return header, jpeg
+
+    def writes(self, fields, text):
+        if self.large:
+            self.later = (self.now_us + 60_000, fields | {"compute_us": 62}, text)
+        else:
+            self.puts(fields | {"compute_us": 2}, text)
+
+    def idle(self):
+        if self.later is not None and self.now_us >= self.later[0]:
+            self.puts(*self.later[1:])
+            self.later = None
 
 
 @breaks("V-HEAD-06", "names no source")

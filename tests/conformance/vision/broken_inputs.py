@@ -1,6 +1,7 @@
 """Broken vision services: too trusting or too strict with headers, pictures and cameras. Pure."""
 
 import json
+import re
 from contextlib import suppress
 
 from sightline.conformance.vision.hostile import CAMERAS, DOUBTED, READ, REJECTED
@@ -65,7 +66,7 @@ trusting_field("V-HOST-09", "v", lambda value: value == "1")
 trusting_field("V-HOST-10", "seq", lambda value: isinstance(value, int) and value < 0)
 trusting_field("V-HOST-11", "seq", lambda value: value == 2**53)
 trusting_field("V-HOST-12", "seq", lambda value: isinstance(value, str))
-trusting_field("V-HOST-13", "seq", lambda value: isinstance(value, float))
+trusting("V-HOST-13", "takes a real `seq`", lambda header: re.search(rb'"seq":\d+\.0\b', header))
 trusting_field("V-HOST-14", "t_us", lambda value: value is True)
 trusting_field("V-HOST-15", "session", lambda value: value == "ABCDEF01")
 trusting_field("V-HOST-16", "session", lambda value: isinstance(value, str) and len(value) == 7)
@@ -73,6 +74,12 @@ trusting_field("V-HOST-20", "pose", lambda value: value == [0, 0])
 trusting_field("V-HOST-21", "pose", lambda value: isinstance(value, list) and value[0] != value[0])
 trusting_field("V-HOST-22", "pose", lambda value: value == [1e7, 0, 0])
 trusting_field("V-HOST-23", "moving", lambda value: value is None)
+trusting_field("V-HOST-25", "v", lambda value: value is True)
+trusting_field("V-HOST-26", "v", lambda value: isinstance(value, float))
+trusting_field("V-HOST-27", "applied", lambda value: len(value) == 1)
+trusting_field("V-HOST-28", "latency_us", lambda value: value == -1)
+trusting_field("V-HOST-29", "moving", lambda value: isinstance(value, str))
+trusting("V-HOST-30", "takes an exponent in `seq`", lambda header: re.search(rb'"seq":\d+e0\b', header))
 lacking("V-HOST-17", "t_us")
 lacking("V-HOST-18", "seq")
 lacking("V-HOST-19", "session")

@@ -144,6 +144,38 @@ def test_vision_service_counts_its_twists_as_a_robot_accepts_them(first, step, o
     assert result.outcome is outcome, result.reason
 
 
+@pytest.mark.parametrize(("name", "change"), [
+    ("V-FRAM-05", {"source": "teleop"}), ("V-HEAD-11", {"mission": {"digest": "00000000", "id": 1}}),
+    ("V-HEAD-03", {"v": 2}), ("V-HEAD-04", {"session": "ABCDEF01"}),
+    ("V-HEAD-05", {"seq": "7"}), ("V-HEAD-06", {"source": None}), ("V-HEAD-07", {"echo": {}}),
+    ("V-HEAD-08", {"compute_us": -1}), ("V-HEAD-10", {"sure": float("nan")}), ("V-CAUS-12", {"compute_us": 10**7}),
+    ("V-SEQ-01", {"session": "0badf00d"}), ("V-CAUS-01", {"echo.channel": "status"}),
+    ("V-CAUS-02", {"echo.session": "0badf00d"}), ("V-CAUS-03", {"echo.seq": 0}), ("V-CAUS-04", {"echo.t_us": 0})])
+def test_vision_service_whose_acks_alone_are_wrong_fails(name, change):
+    def writes(self, fields, text):
+        if text is None:
+            echo = fields["echo"] | {key[5:]: value for key, value in change.items() if key.startswith("echo.")}
+            fields = fields | {"echo": echo} | {key: value for key, value in change.items() if "." not in key}
+        self.puts(fields, text)
+
+    broken = type("Acks", (BrokenVision,), {"writes": writes})
+    result = result_of(next(case for case in VIRTUAL if case.id == name), broken)
+    assert result.outcome is Outcome.FAILED, result.reason
+
+
+@pytest.mark.parametrize("nth", [10, 20, 45])
+def test_vision_service_that_leaves_out_each_nth_frame_fails(nth):
+    class LeavesOut(BrokenVision):
+        count = 0
+
+        def hears(self, header, jpeg):
+            self.count += 1
+            return None if self.count % nth == 0 else (header, jpeg)
+
+    result = result_of(next(case for case in VIRTUAL if case.id == "V-FLOW-05"), LeavesOut)
+    assert (result.outcome, "got no answer" in result.reason) == (Outcome.FAILED, True), result.reason
+
+
 class NotFinite(BrokenVision):
     """Answers an image with a number that is not finite where the odometry or the lens is at its bounds."""
 
