@@ -231,7 +231,7 @@ REJECTED: Final[dict[str, tuple[str, Callable[[], bytes]]]] = {
     "V-LIM-07": ("A lossless JPEG (SOF3)", lambda: claiming(320, 240, marker=0xC3)),
     "V-LIM-08": ("An arithmetic JPEG (SOF9)", lambda: claiming(320, 240, marker=0xC9)),
     "V-LIM-09": ("A JPEG whose scan comes before its frame header", lambda: b"\xff\xd8\xff\xda\x00\x08" + bytes(6)),
-    "V-LIM-10": ("A JPEG with 64 segments before its frame header", lambda: commented(picture("left"), 64)),
+    "V-LIM-10": ("A JPEG with 64 segments before its frame header", lambda: commented(picture("left"), 63)),
     "V-LIM-11": ("A JPEG with a segment that ends beyond it", lambda: b"\xff\xd8\xff\xfe\xff\xff" + bytes(8)),
     "V-LIM-12": ("A JPEG cut in its frame header", lambda: claiming(320, 240)[:11]),
     "V-LIM-13": ("A JPEG of a start and nothing else", lambda: b"\xff\xd8"),
@@ -240,9 +240,10 @@ REJECTED: Final[dict[str, tuple[str, Callable[[], bytes]]]] = {
     "V-LIM-16": ("A text", lambda: b"0.5000|0.0000"),
     "V-LIM-17": ("A JPEG that claims the right size and has no pixels", lambda: claiming(320, 240)),
     "V-LIM-20": ("A JPEG with a segment of length zero", lambda: b"\xff\xd8\xff\xfe\x00\x00" + picture("left")[2:]),
-    "V-LIM-22": ("A JPEG with 64 fill bytes before its frame header", lambda: filled(picture("left"), 64)),
-    "V-LIM-23": ("A JPEG with 64 markers without a length before its frame header",
-                 lambda: picture("left")[:2] + b"\xff\x01" * 64 + picture("left")[2:]),
+    "V-LIM-22": ("A JPEG with its tables and 63 fill bytes before its frame header",
+                 lambda: filled(picture("left"), 63)),
+    "V-LIM-23": ("A JPEG with its tables and 63 markers without a length before its frame header",
+                 lambda: picture("left")[:2] + b"\xff\x01" * 63 + picture("left")[2:]),
     "V-LIM-19": ("A picture of another size than the camera's", lambda: picture("left_half")),
     "V-LIM-18": ("A JPEG of zeros after its start", lambda: b"\xff\xd8" + bytes(4_000)),
 }
@@ -290,8 +291,8 @@ def scan_bomb(bench: Bench, robot: RobotPlayed) -> None:
 
 READ: Final[dict[str, tuple[str, str, Level, Callable[[], bytes]]]] = {
     "V-LIM-41": ("3.1 Payload", "A progressive JPEG is read.", Level.MUST, lambda: picture("left_progressive")),
-    "V-LIM-42": (_CHECK, "A JPEG with 61 comments before its tables is read.", Level.MUST,
-                 lambda: commented(picture("left"), 61)),
+    "V-LIM-42": (_CHECK, "A JPEG with 62 comments before its tables is read.", Level.MUST,
+                 lambda: commented(picture("left"), 62)),
     "V-LIM-43": ("3.1 Payload", "A grey JPEG is read.", Level.MUST, lambda: picture("grey")),
     "V-LIM-44": ("1.4 Sizes", "A JPEG of 200 kB is read.", Level.SHOULD,
                  lambda: commented(picture("left"), _LARGE_SEGMENTS, 65_000)),

@@ -1,14 +1,16 @@
-"""Cases about missions, reports and detections: rate, followed target, result for each image. Pure."""
+"""Cases about missions, reports and detections: rate, target, result for each image, boxes of another peer. Pure."""
 
 import math
+from functools import partial
 from typing import Any, Final
 
 from sightline.conformance.case import NOT_DRIVING, Bench, Model, Received, Suite
-from sightline.conformance.vision.fixture import ANSWER_US, ARMED, RobotPlayed, Sent, met
+from sightline.conformance.vision.fixture import ANSWER_US, ARMED, RobotPlayed, Sent, VisionAnswer, met
 from sightline.conformance.vision.images import CAMERA as LENS
 from sightline.protocol.channels import DETECTIONS, MISSION, REPORT, STATUS
 from sightline.protocol.codec import encode
 from sightline.protocol.messages import (
+    MAX_INTEGER,
     DetectedBox,
     Detections,
     DetectionsHeader,
@@ -186,6 +188,111 @@ def label(bench: Bench) -> None:
     bench.need(pairs, "it publishes no target and detections of one image")
     for name, labels in pairs:
         bench.expect(name in labels, f"the target is {name!r}, the boxes are {labels}")
+
+
+# --- detections of another peer ---------------------------------------------------------------------------------------
+
+_DETECTOR: Final = "detector"
+_LEFT_PX: Final = 60.0
+_RIGHT_PX: Final = 260.0
+_TURN_RAD_S: Final = 0.01
+
+
+class _Detector:
+    """A detector that the kit plays: its boxes are at places where the images of the robot show nothing."""
+
+    def __init__(self, robot: RobotPlayed) -> None:
+        self.robot, self.bench, self._session = robot, robot.bench, f"{robot.bench.number():08x}"
+
+    def look(self) -> Sent:
+        """Send an image without a target, and return it once it is answered."""
+        sent = self.robot.frame("absent")
+        self.robot.is_answered(sent)
+        return sent
+
+    def find(self, x_px: float, sent: Sent | None, **changes: Any) -> None:
+        """Publish a box with this center in the image `sent`; `changes` replace fields of its echo."""
+        echo = None
+        if sent is not None:
+            echo = Echo.model_construct(channel="frame", session=sent.session, seq=sent.seq, t_us=sent.t_us)
+            echo = echo.model_copy(update=changes)
+        number = self.bench.number()
+        box = DetectedBox(label="ball", score=0.9, x1_px=x_px - _TARGET_RADIUS_PX, y1_px=100.0,
+                          x2_px=x_px + _TARGET_RADIUS_PX, y2_px=140.0)
+        header = DetectionsHeader(source=_DETECTOR, session=self._session, seq=number, echo=echo)
+        found = Detections(width_px=LENS.width_px, height_px=LENS.height_px, boxes=(box,))
+        self.bench.publish(DETECTIONS, header, found, _DETECTOR)
+
+    def turns(self, x_px: float) -> float:
+        """Return the angular velocity of the last twist to a row of images with a box at this place."""
+        for _ in range(_SECOND // 2):
+            sent = self.look()
+            self.find(x_px, sent)
+            self.bench.rest(_EVERY_US)
+        return self.robot.twists_to(sent)[-1].speeds[1] if self.robot.is_driven(sent) else 0.0
+
+    def twists(self, since: int) -> list[VisionAnswer]:
+        """Return the twists since a mark, after the time of an answer."""
+        self.bench.rest(ANSWER_US)
+        return self.robot.twists(since)
+
+    def expect_no_twist(self, since: int, what: str) -> None:
+        """Fail the case if a twist came since a mark."""
+        self.bench.expect(not self.twists(since), f"it steered by boxes {what}")
+
+
+def _steers_by_boxes(bench: Bench) -> _Detector:
+    """Begin the cases about boxes of another peer. Not applicable unless the service drives by them alone."""
+    for x_px, side in ((_LEFT_PX, 1), (_RIGHT_PX, -1)):
+        detector = _Detector(RobotPlayed(bench))
+        bench.need(detector.turns(x_px) * side > _TURN_RAD_S, f"it does not steer by the boxes of `{_DETECTOR}`")
+        detector.robot.stop()
+    mark = bench.mark()
+    detector.look()
+    bench.need(not detector.twists(mark), f"it also drives without boxes of `{_DETECTOR}`")
+    return detector
+
+
+@SUITE.must("V-STEER-13", "12.4 Steering by them", _steers_by_boxes)
+def cites_the_frame_of_the_boxes(bench: Bench, detector: _Detector) -> None:
+    """A twist by the boxes of another peer cites the frame of the boxes, also after newer frames."""
+    mark = bench.mark()
+    looked_at = detector.look()
+    for _ in range(2):
+        bench.rest(_EVERY_US)
+        detector.look()
+    detector.find(_RIGHT_PX, looked_at)
+    twists = detector.twists(mark)
+    bench.need(twists, "it does not steer by boxes that come late")
+    bench.expect(all(one.cites(looked_at) for one in twists),
+                 f"boxes of frame {looked_at.seq}: it sent {twists[0].words()}")
+
+
+def _steers_by_none(what: str, changes: dict[str, Any] | None, detector: _Detector) -> None:
+    """Fail the case if boxes steer whose echo has these changes, or which have none."""
+    mark, sent = detector.bench.mark(), detector.look()
+    detector.find(_RIGHT_PX, None if changes is None else sent, **changes or {})
+    detector.expect_no_twist(mark, what)
+
+
+def _steers_by_no_older(detector: _Detector) -> None:
+    """Fail the case if boxes of a frame steer that is older than that of the last boxes."""
+    older, newer = detector.look(), detector.look()
+    detector.find(_RIGHT_PX, newer)
+    detector.robot.is_driven(newer)
+    mark = detector.bench.mark()
+    detector.find(_RIGHT_PX, older)
+    detector.expect_no_twist(mark, "of an older frame")
+
+
+SUITE.must_all(_steers_by_boxes, {
+    "V-STEER-14": ("12.4 Steering by them", "Boxes of another peer without an `echo` steer nothing.",
+                   partial(_steers_by_none, "without an echo", None)),
+    "V-STEER-15": ("12.4 Steering by them", "Boxes of another peer steer nothing if they cite a frame never sent.",
+                   partial(_steers_by_none, "of a frame that was never sent", {"seq": MAX_INTEGER})),
+    "V-STEER-16": ("12.4 Steering by them", "Boxes of another peer steer nothing after those of a newer frame.",
+                   _steers_by_no_older),
+})
 
 
 # --- missions --------------------------------------------------------------------------------------------------------

@@ -12,8 +12,6 @@ UNTESTED = {
     "5.5 A picture that does not change": "the kit cannot freeze a robot's camera; tests/robot_side/safety",
     "5.6 Reasons": "the text that a peer shows to an operator is not on the wire; V-STAT-05 sends an unknown reason",
     "7.6 Loss": "a SHOULD, and the kit's links lose nothing; tests/robot_side/network/test_loss.py",
-    "12.4 Steering by them":
-        "for a vision service that steers by the boxes of another source, which few do; tests/vision_side/serving",
     "13.1 Security": "a link without keys promises clauses 5 and 6",
     "13.3 Zenoh": "a denial is silent; protocol/transports/test_security_zenoh.py tries every role on every channel",
     "13.4 WebSocket": "it sums up 14.2 and 14.3",

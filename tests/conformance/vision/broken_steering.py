@@ -1,8 +1,11 @@
 """Broken vision services: those that steer where they should not. Pure."""
 
+import json
+
 from sightline.conformance.vision.images import CAMERA
+from sightline.protocol.channels import DETECTIONS
 from sightline.protocol.messages import Twist
-from sightline.vision_side.pipeline import PipelineAnswer
+from sightline.vision_side.pipeline import Observation, PipelineAnswer
 from tests.conformance.vision.broken import BrokenVision, breaks
 from tests.conformance.vision.broken_answers import PerSession
 
@@ -116,3 +119,60 @@ class SwappedAxes(BrokenVision):
 
     def writes(self, fields, text):
         self.puts(fields, None if text is None else b"|".join(reversed(text.split(b"|"))))
+
+
+BY_BOXES = Observation("by boxes")
+
+
+class Boxes(BrokenVision):
+    """Steers by the boxes of `detector` as soon as some come in a session, and only acknowledges frames then."""
+
+    def __init__(self, network, robot="r1"):
+        super().__init__(network, robot)
+        self.frames, self.newest, self.steered, self.session = {}, None, -1, ""
+        self.link.subscribe(DETECTIONS, self.on_boxes)
+
+    def decides(self, header, answer):
+        if answer.seen is BY_BOXES:
+            return answer
+        self.newest = self.frames[header.seq] = header
+        return PipelineAnswer(None, answer.seen) if header.session == self.session else answer
+
+    def on_boxes(self, message):
+        echo = json.loads(message.header).get("echo")
+        box = json.loads(message.payload)["boxes"][0]
+        left_px = CAMERA.cx_px - (box["x1_px"] + box["x2_px"]) / 2
+        self.steered = self.steered if self.newest.session == self.session else -1
+        self.session = self.newest.session
+        frame = self.cited(echo, self.frames.get(echo["seq"]) if echo else None)
+        if frame is not None:
+            self.steered = frame.seq
+            self._publish(frame, PipelineAnswer(Twist(linear_mps=0, angular_rad_s=left_px / 200), BY_BOXES), 0)
+
+    def cited(self, echo, frame):
+        """Return the header of the frame that a twist by boxes cites; None to reject the boxes."""
+        return frame if frame is not None and frame.seq > self.steered else None
+
+
+@breaks("V-STEER-13", "cites the newest frame for boxes of an older one")
+class CitesNewest(Boxes):
+    def cited(self, echo, frame):
+        return self.newest if super().cited(echo, frame) else None
+
+
+@breaks("V-STEER-14", "takes boxes without an echo for those of the newest frame")
+class NeedsNoEcho(Boxes):
+    def cited(self, echo, frame):
+        return super().cited(echo, frame) if echo else self.newest
+
+
+@breaks("V-STEER-15", "takes boxes of an unknown frame for those of the newest")
+class KnowsAllFrames(Boxes):
+    def cited(self, echo, frame):
+        return self.newest if echo and frame is None else super().cited(echo, frame)
+
+
+@breaks("V-STEER-16", "goes back to the boxes of an older frame")
+class GoesBack(Boxes):
+    def cited(self, echo, frame):
+        return frame

@@ -11,12 +11,12 @@ from sightline.conformance.case import Access, Bench
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import CameraModel, FrameHeader
 from sightline.protocol.transports.memory import MemoryLink, MemoryNetwork
-from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.config import BoxesConfig, VisionConfig
 from sightline.vision_side.decode import DecodedImage, Decoder
 from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.detect.port import Detection, Maker, result_of
 from sightline.vision_side.pipeline import Pipeline, PipelineAnswer
-from sightline.vision_side.serving.service import Service
+from sightline.vision_side.serving.service import BoxesService, Service
 
 COMPUTE_US = 2_000
 """Compute time that the reference reports for a frame; virtual answers take a step of 5 ms."""
@@ -90,6 +90,31 @@ class VirtualVision(Service):
 
     def _publish(self, header: FrameHeader, answer: PipelineAnswer, compute_us: int) -> None:
         super()._publish(header, answer, COMPUTE_US)
+
+
+class VirtualBoxes(BoxesService):
+    """The reference without a detector: it steers by the boxes of `detector`."""
+
+    def __init__(self, network: MemoryNetwork, robot: str = "r1") -> None:
+        self.network, self.now_us = network, 0
+        config = CONFIG.model_copy(update={"boxes": BoxesConfig(source="detector")})
+        super().__init__(config, network.link(robot, role="vision"), lambda line: None)
+
+    def tick(self, now_us: int) -> None:
+        self.now_us = now_us
+        self.turn(0.0)
+
+    def _now_us(self) -> int:
+        return self.now_us
+
+
+BY_BOXES = ("V-STEER-13", "V-STEER-14", "V-STEER-15", "V-STEER-16")
+"""Cases for a service that steers by boxes. For a service with a detector they are not applicable."""
+
+
+def reference(case: str) -> type[Service]:
+    """Return the service that conforms in a case."""
+    return VirtualBoxes if case in BY_BOXES else VirtualVision
 
 
 def virtual_bench(vision=VirtualVision) -> Bench:
