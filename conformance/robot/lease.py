@@ -331,8 +331,8 @@ def copied_identity_bars_no_driver(_bench: Bench, first: Sender) -> None:
 
 @SUITE.must("R-PROOF-05", "6.6 Proof", ready)
 def lost_commands_are_no_forgery(_bench: Bench, first: Sender) -> None:
-    """A proof that is 40 commands ahead continues: so many may be lost."""
-    for _ in range(40):
+    """A proof that is 64 commands ahead continues: 63 may be lost."""
+    for _ in range(63):
         first.proofs.next()
     first.expect(GOOD)
 

@@ -123,13 +123,15 @@ def _measured_within(robot: Robot, status: Status) -> None:
 
 @SUITE.must("R-LIM-05", "4.3 Limits", armed)
 def clamped_is_counted(bench: Bench, driver: Sender) -> None:
-    """A value beyond the limits is counted as CLAMPED, one within them is not."""
+    """A value beyond the limits is counted as CLAMPED, one within them is not; `last_refusal` never names it."""
     before = driver.robot.next_status().refused.get(CLAMPED, 0)
     within = driver.robot.next_status(2).refused.get(CLAMPED, 0)
     bench.expect(within == before, f"{within - before} twists within the limits were counted as CLAMPED")
     driver.drive(b"48.0000|0.0000")
     grows = driver.robot.counts(CLAMPED, within, 600_000)
     bench.expect(grows, f"48 m/s was not counted as CLAMPED: {driver.robot.status().refused}")
+    last = driver.robot.next_status().last_refusal
+    bench.expect(last is None or last.reason != CLAMPED, f"last_refusal is {last}, but the command was accepted")
 
 
 @SUITE.should("R-LIM-06", "4.3 Limits", Robot)

@@ -191,6 +191,18 @@ def reason_of_the_state(bench: Bench, robot: Robot) -> None:
     bench.expect(unarmed and stopped and unarmed != stopped, f"{unarmed!r}, then {stopped!r}")
 
 
+@SUITE.must("R-STAT-13", "2.3 Text", ready)
+def texts_are_one_line(bench: Bench, sender: Sender) -> None:
+    """Texts for an operator are one line: `reason` and `last_refusal` of a status, `detail` of a reply."""
+    sender.twist_result(b"nan|0")
+    reply = Sender(sender.robot, "operator").reply("arm")
+    status = sender.robot.status()
+    texts = {"reason": status.reason, "detail of a reply": reply.detail,
+             "detail of last_refusal": status.last_refusal.detail if status.last_refusal else ""}
+    for name, text in texts.items():
+        bench.expect(text.isprintable(), f"{name} is {text!r}")
+
+
 @SUITE.must("R-STAT-08", "9. Status", Robot)
 def applied_is_reported(bench: Bench, robot: Robot) -> None:
     """`applied` in `status` is what is given to the wheels: above zero while driving, zero at rest."""

@@ -21,7 +21,8 @@ NOT_APPLICABLE = {"javascript-robot": {"R-FRAM-11", *(f"R-LEASE-{number}" for nu
                   "javascript-vision": {*(f"V-REP-0{number}" for number in range(1, 7)),
                                         *(f"V-REQ-0{number}" for number in range(2, 6)), *BY_BOXES}}
 """Cases that a peer's choices leave nothing to test in: the JavaScript robot publishes no scan, and has no Zenoh; the
-JavaScript vision service publishes no reports and no detections, knows no missions, and steers by no boxes of another peer."""
+JavaScript vision service publishes no reports and no detections, knows no missions, and does not steer by the boxes of
+another peer."""
 
 
 AT_ONCE = 8

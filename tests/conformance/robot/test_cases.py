@@ -9,15 +9,16 @@ from sightline.conformance.case import GROUPS, KEPT_MESSAGES, Case, Level, Suite
 from sightline.conformance.report import summary
 from sightline.conformance.robot.cases import CASES, prepare
 from sightline.conformance.runner import Outcome, chosen, passed, run_case, run_cases, untested
+from sightline.protocol import proof
 from sightline.protocol.channels import STATUS
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import CLAMPED, ConfigError
 from sightline.robot_side.network.core import NetworkCore
 from sightline.robot_side.network.stream import StreamConfig
 from tests.conformance.clauses import clauses
 from tests.conformance.robot import reference
 from tests.conformance.robot.broken import arming as broken_arming
 from tests.conformance.robot.broken import motion as broken_motion
-from tests.conformance.robot.broken.breaking import fields_of
+from tests.conformance.robot.broken.breaking import bend_out, fields_of
 from tests.conformance.robot.reference import virtual_robot
 
 pytestmark = pytest.mark.computes
@@ -60,6 +61,36 @@ def test_robot_slower_than_the_usual_twist_of_the_kit_passes():
     bench, _robot = virtual_robot(max_linear_mps=0.08)
     results = run_cases([case for case in VIRTUAL if case.id in ("R-LIM-01", "R-LIM-08")], bench, prepare)
     assert [one.reason for one in results if one.outcome is not Outcome.PASSED] == []
+
+
+def _two_lines(robot, channel, *path):
+    def bend(_header, payload):
+        for name in path[:-1]:
+            payload = payload.get(name) or {}
+        if path[-1] in payload:
+            payload[path[-1]] += "\nmore"
+
+    bend_out(robot, channel, bend)
+
+
+@pytest.mark.parametrize("path", [("status", "last_refusal", "detail"), ("reply", "detail")], ids="-".join)
+def test_robot_with_a_text_of_two_lines_fails(path):
+    assert result_of(CASES_BY_ID["R-STAT-13"], lambda robot: _two_lines(robot, *path)).outcome is Outcome.FAILED
+
+
+def test_robot_that_shows_a_reduced_command_as_a_rejection_fails():
+    def bend(_header, payload):
+        if payload["refused"].get(CLAMPED):
+            payload["last_refusal"] = {"source": "vision", "reason": CLAMPED, "detail": "48 m/s is too fast"}
+
+    result = result_of(CASES_BY_ID["R-LIM-05"], lambda robot: bend_out(robot, "status", bend))
+    assert (result.outcome, "last_refusal" in result.reason) == (Outcome.FAILED, True), result.reason
+
+
+@pytest.mark.parametrize(("hashes", "outcome"), [(63, Outcome.FAILED), (64, Outcome.PASSED)])
+def test_robot_that_hashes_a_proof_less_than_64_times_fails(monkeypatch, hashes, outcome):
+    monkeypatch.setattr(proof, "MAX_LOST", hashes)
+    assert result_of(CASES_BY_ID["R-PROOF-05"]).outcome is outcome
 
 
 def one_frame_in(count, break_it=None):

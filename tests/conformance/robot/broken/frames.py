@@ -192,6 +192,11 @@ def refusal_names_nobody(robot):
     bend_out(robot, "status", bend)
 
 
+@breaks("R-STAT-13")
+def reason_has_two_lines(robot):
+    bend_out(robot, "status", lambda _header, payload: payload.update(reason=payload["reason"] + "\n(see the log)"))
+
+
 @breaks("R-STAT-03")
 def counts_refused_as_accepted(robot):
     def around(inner, source, error):
