@@ -172,7 +172,8 @@ def _blind(guard: GuardConfig, scan: Ranges) -> Iterator[float]:
     """Yield the clearance at both ends of the blind part of each ray. The outline is convex, so the ends suffice."""
     for index in range(len(scan.ranges_m)):
         angle_rad = scan.angle_min_rad + index * scan.angle_increment_rad
-        for range_m in (0.0, scan.range_min_m):
+        # The sensor itself, the near end of every ray, counts once.
+        for range_m in (scan.range_min_m,) if index else (0.0, scan.range_min_m):
             x_m, y_m = guard.sensor_x_m + range_m * math.cos(angle_rad), range_m * math.sin(angle_rad)
             ahead_m, aside_m = max(x_m - guard.front_m, -guard.rear_m - x_m), abs(y_m) - guard.half_width_m
             yield math.hypot(max(0.0, ahead_m), max(0.0, aside_m))

@@ -367,6 +367,15 @@ def test_a_scan_without_rays_has_no_blind_zone():
     assert not is_refused(blind_scan(8.0, rays=0), stop_m=0.02)
 
 
+@pytest.mark.parametrize("rays", [1, 2, 360])
+def test_each_ray_is_computed_once(rays, monkeypatch):
+    """A scan may have 16,384 rays, and the wheels wait for the check."""
+    angles_rad, cos = [], math.cos
+    monkeypatch.setattr("sightline.robot_side.safety.guard.math.cos", lambda at: angles_rad.append(at) or cos(at))
+    assert not is_refused(blind_scan(0.1, 0.0, 0.01, rays))
+    assert len(angles_rad) == rays + 1, "and the sensor itself"
+
+
 @pytest.mark.parametrize(("first_rad", "each_rad", "refused"), [
     (-math.pi, math.pi / 2, True), (-math.pi, math.pi, False), (math.pi / 4, math.pi / 4, True),
 ])  # fmt: skip
