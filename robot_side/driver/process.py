@@ -414,9 +414,9 @@ class Driver:
             if self._battery_reader is not None and self._battery_reader.newest is not None:
                 self._driver_core.on_battery(*self._battery_reader.newest)
             speeds = self._driver_core.tick(monotonic_us(), wheels, scan)
-        except BlindZoneError:  # from the first scan; without a scan the robot does not move
-            raise
         except PLUGIN_ERRORS as error:  # third-party code; a reading may have any type
+            if isinstance(error, BlindZoneError) and not self._scan_layout:
+                raise  # the first scan does not fit the configuration; without a scan the robot does not move
             self._fault(part, error)
             speeds = self._without_sensors()
         try:

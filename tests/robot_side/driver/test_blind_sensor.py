@@ -1,13 +1,17 @@
-"""A real robot process with a range sensor that does not see the stop zone: it does not start, or it ends."""
+"""A real robot process with a range sensor that does not see the stop zone: it does not start, or it stops."""
 
 import array
 import math
 import time
 from pathlib import Path
 
+from sightline.operator_side.client.requests import Operator
+from sightline.protocol.clock import monotonic_us
 from sightline.protocol.config import Config
+from sightline.protocol.messages import State
 from sightline.robot_side.ports import Ranges
-from tests.fixtures.robot_process import RobotProcess
+from tests.fixtures.links import until
+from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
 
 class Settings(Config):
@@ -46,11 +50,21 @@ def test_robot_with_a_blind_sensor_does_not_start(tmp_path):
         assert robot.speed() == 0.0 and robot.motor_rows(), "the motors were set to zero"
 
 
-def test_robot_ends_when_its_sensor_turns_blind(tmp_path):
+def test_robot_whose_sensor_turns_blind_while_it_drives_stays_in_fault(tmp_path):
+    """It does not end, so an operator reads the reason. A reset lasts until the next scan."""
     fog = tmp_path / "fog"
     sensor = {"kind": f"{__name__}:NearSighted", "options": {"fog": str(fog)}}
     with RobotProcess(tmp_path, range_sensor=sensor, guard={"stop_m": 0.13}) as robot:
         robot.wait_until_on()
-        fog.touch()
-        assert robot.process.wait(10) == 2
-        assert "below 1.13 m" in robot.output() and robot.speed() == 0.0
+        with Vision(robot.endpoint) as vision:
+            assert driving(robot)
+            fog.touch()
+            assert until(lambda: vision.status().state is State.FAULT and robot.speed() == 0.0, 5)
+            seen, operator = vision.status(), Operator(vision.link)
+            assert "below 1.13 m" in seen.reason and seen.faults == {"range sensor": seen.faults["range sensor"]}
+            assert operator.reset().ok
+            assert until(lambda: vision.status().state is State.FAULT, 5)
+            since_us = monotonic_us()
+            time.sleep(0.3)
+            assert not any(left or right for t_us, left, right in robot.motor_rows() if t_us > since_us)
+        assert robot.process.poll() is None and robot.output().count("Traceback") == 1
