@@ -19,7 +19,6 @@ from typing import Any, Final
 from sightline.protocol.channels import REQUEST, TWIST
 from sightline.protocol.clock import heartbeat_us, monotonic_us
 from sightline.protocol.codec import decode
-from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import HardwareError, RejectReason, SightlineError, WireError
 from sightline.protocol.log import (
     RepeatLimiter,
@@ -62,6 +61,7 @@ _log: Final = logging.getLogger(__name__)
 #
 # Motors keep their last speed, so their process must outlive every other fault. The network process may hang, die or
 # hold its interpreter lock forever. This loop still reads its own clock 50 times a second and stops the wheels.
+# It handles the signals of a terminal, so a KeyboardInterrupt or any other BaseException is an error of a plug-in.
 
 
 _SHUTDOWN_US = 2_000_000
@@ -175,7 +175,7 @@ def _close(part: str, device: Drive | RangeSensor | Battery) -> None:
     """Close a device. The motors are at zero, so its exception is only reported."""
     try:
         device.close()
-    except PLUGIN_ERRORS as error:
+    except BaseException as error:
         report_fault(part, error)
 
 
@@ -205,7 +205,7 @@ def _zero(config: RobotConfig, set_to_zero: Callable[[], None]) -> None:
         set_to_zero()
     except SightlineError:
         raise
-    except PLUGIN_ERRORS as error:
+    except BaseException as error:
         report_ending("drive", error)
         what = DRIVES.failed(config.drive, error)
         raise HardwareError(f"motors NOT set to zero: {what}; switch off their supply") from None
@@ -238,7 +238,7 @@ class BatteryReader:
             begin_us = monotonic_us()  # the age of a reading counts from its start, also if it hung
             try:
                 self.newest = self._read(), begin_us
-            except PLUGIN_ERRORS as error:
+            except BaseException as error:
                 if not self._closing.is_set():
                     report_fault("battery", error)
             self._closing.wait(_BATTERY_PERIOD_S)
@@ -414,7 +414,7 @@ class Driver:
             if self._battery_reader is not None and self._battery_reader.newest is not None:
                 self._driver_core.on_battery(*self._battery_reader.newest)
             speeds = self._driver_core.tick(monotonic_us(), wheels, scan)
-        except PLUGIN_ERRORS as error:  # third-party code; a reading may have any type
+        except BaseException as error:  # third-party code; a reading may have any type
             if isinstance(error, BlindZoneError) and not self._scan_layout:
                 raise  # the first scan does not fit the configuration; without a scan the robot does not move
             self._fault(part, error)
@@ -423,7 +423,7 @@ class Driver:
             self._drive.set(*speeds)
             self._speeds_are_set, self._rejects_since_us = True, 0
             self._driver_core.gate.note_drive(before, is_taken=True)
-        except PLUGIN_ERRORS as error:
+        except BaseException as error:
             self._driver_core.gate.note_drive(before, is_taken=False)
             self._rejects_since_us = self._rejects_since_us or heartbeat_us()
             self._fault("drive", error)

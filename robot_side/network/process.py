@@ -18,7 +18,6 @@ from typing import Final
 from sightline.protocol.channels import ACK, FRAME, REQUEST, TWIST
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
-from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import HardwareError, SightlineError, WireError
 from sightline.protocol.log import RepeatLimiter, count_fault, error_line, fault_text, faults, report_fault, start_log
 from sightline.protocol.messages import CameraModel
@@ -146,7 +145,7 @@ class NetworkProcess:
         """Return the model of the camera, or None for an invalid one, which `check_image` reports."""
         try:
             model: object = self.camera.model if self.camera else None
-        except PLUGIN_ERRORS:
+        except BaseException:
             return None
         return model if isinstance(model, CameraModel) else None
 
@@ -182,7 +181,7 @@ class NetworkProcess:
             picture = self.camera.read(_CAMERA_TIMEOUT_S)
             if picture is not None:
                 check_image(self.camera, picture)
-        except PLUGIN_ERRORS as error:
+        except BaseException as error:  # signals are ignored, so a KeyboardInterrupt is an error of the camera, too
             self._on_camera_error(error)
             return None
         if picture is not None:

@@ -5,6 +5,7 @@ import select
 import signal
 import socket
 import threading
+from asyncio import CancelledError
 
 import pytest
 
@@ -201,7 +202,8 @@ def test_hanging_reading_has_the_age_of_its_start_and_its_thread_closes_the_devi
     assert until(lambda: battery.closed_by == "battery")
 
 
-def test_each_failed_reading_of_the_battery_is_counted_and_its_close_too(monkeypatch):
+@pytest.mark.parametrize("error", [OSError("no such battery"), CancelledError("odd")])
+def test_each_failed_reading_of_the_battery_is_counted_and_its_close_too(monkeypatch, error):
     monkeypatch.setattr("sightline.robot_side.driver.process._BATTERY_PERIOD_S", 0.01)
 
     readings, before = [], faults()["battery"]
@@ -210,11 +212,11 @@ def test_each_failed_reading_of_the_battery_is_counted_and_its_close_too(monkeyp
         def read(self):
             readings.append(12.0)
             if len(readings) <= 3:
-                raise OSError("no such battery")
+                raise error
             return readings[-1]
 
         def close(self):
-            raise OSError("no such battery")
+            raise error
 
     reader = BatteryReader(Gone())
     assert until(lambda: reader.newest)

@@ -1,12 +1,15 @@
 """Whatever breaks beside the driver's loop, the wheels end at zero: devices, disk, terminal, the child's packets."""
 
+import array
 import math
 import os
 import signal
 import socket
 import subprocess
 import time
+from asyncio import CancelledError
 from contextlib import suppress
+from types import SimpleNamespace
 
 import pytest
 
@@ -29,7 +32,8 @@ from sightline.robot_side.guardian.core import (
     unpack_beat,
 )
 from sightline.robot_side.guardian.start import GuardianEnd
-from sightline.robot_side.ports import WheelAngles
+from sightline.robot_side.ports import Ranges, WheelAngles
+from sightline.robot_side.safety.guard import BlindZoneError
 from sightline.robot_side.safety.limits import SafetyConfig
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
@@ -125,12 +129,41 @@ def test_a_gate_that_cannot_be_stepped_is_a_fault_with_the_wheels_at_zero(driver
     assert BrokenDrive.told == (0.0, 0.0), "it does not take up the speed of before"
 
 
-@pytest.mark.parametrize("error", [OSError("unplugged"), ValueError("what"), RuntimeError()])
-def test_a_drive_that_raises_anything_is_a_fault(driver, error):
+@pytest.mark.parametrize("error", [
+    OSError("unplugged"), ValueError("what"), RuntimeError(), SystemExit(9), CancelledError("odd"), GeneratorExit()])
+def test_a_device_that_raises_anything_is_a_fault_and_logged(driver, error, caplog, monkeypatch):
     driver._tick(20_000)
     BrokenDrive.fails = error
     driver._tick(40_000)
     assert driver._driver_core.gate.state == "FAULT" and not driver._speeds_are_set
+    BrokenDrive.fails = None
+
+    def fail():
+        raise error
+
+    monkeypatch.setattr(driver, "_ranges", SimpleNamespace(read=fail))
+    driver._tick(60_000)
+    assert driver._speeds_are_set and BrokenDrive.told == (0.0, 0.0)
+    name = type(error).__name__
+    assert f"drive raised {name}" in caplog.text and f"range sensor raised {name}" in caplog.text
+
+
+def test_sensor_that_turns_blind_after_its_first_scan_is_a_fault(driver, monkeypatch):
+    scans = []
+    monkeypatch.setattr(driver, "_ranges", SimpleNamespace(read=scans.pop))
+    for least_m in (0.05, 9.0, 9.0, 0.05):
+        scans.append(Ranges(20_000, 0.0, 0.1, least_m, 8.0, array.array("f", [math.inf] * 3)))
+    for expected in ("DISARMED", "FAULT", "FAULT", "FAULT"):
+        driver._tick(20_000)
+        assert driver._driver_core.gate.state == expected and BrokenDrive.told == (0.0, 0.0)
+    assert "blind below 9 m" in driver._driver_core.gate.reason
+
+
+def test_sensor_that_is_blind_at_its_first_scan_ends_the_robot(driver, monkeypatch):
+    scan = Ranges(20_000, 0.0, 0.1, 9.0, 8.0, array.array("f", [math.inf] * 3))
+    monkeypatch.setattr(driver, "_ranges", SimpleNamespace(read=lambda: scan))
+    with pytest.raises(BlindZoneError, match="blind below 9 m"):
+        driver._tick(20_000)
 
 
 def test_speeds_that_the_drive_did_not_take_are_not_shown_as_applied(driver, monkeypatch):
@@ -207,9 +240,9 @@ def run_with(tmp_path, monkeypatch):
         signal.signal(number, handler)
 
 
-def unplug(_driver):
+def unplug(_driver, error=None):
     """End the loop with a drive that takes no more speeds."""
-    BrokenDrive.told, BrokenDrive.fails = (0.0, 0.0), OSError("unplugged")
+    BrokenDrive.told, BrokenDrive.fails = (0.0, 0.0), error or OSError("unplugged")
     return 0
 
 
@@ -227,6 +260,14 @@ def test_drive_that_still_fails_at_the_end_gives_the_exit_code_that_calls_zero(r
     with pytest.raises(HardwareError, match=r"motors NOT set to zero: .* OSError: unplugged; switch off") as error:
         run_with(unplug)
     assert needs_zero(error.value.exit_code, was_ready=True, was_running=False)
+
+
+@pytest.mark.parametrize("error", [CancelledError("odd"), GeneratorExit("odd")])
+def test_drive_that_raises_no_usual_exception_at_the_end_is_logged_too(run_with, error, caplog):
+    caplog.set_level("INFO", "sightline")
+    with pytest.raises(HardwareError, match=f"NOT set to zero: .* {type(error).__name__}"):
+        run_with(lambda _driver: unplug(_driver, error))
+    assert f"drive raised {type(error).__name__}" in caplog.text
 
 
 @pytest.mark.parametrize(("loop", "beat"), [(lambda _driver: 0, ENDING), (unplug, FAILED)])

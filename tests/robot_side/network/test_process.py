@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 import zlib
+from asyncio import CancelledError
 from pathlib import Path
 
 import pytest
@@ -227,6 +228,21 @@ def test_wrong_image_is_a_fault_of_the_camera_and_ends_nothing(process, link, mo
         delattr(process.camera, name)
     process._stream_one()
     assert FRAME in link.published and not process._network_core.image_fault
+
+
+@pytest.mark.parametrize("error", [SystemExit(9), CancelledError("odd"), GeneratorExit("odd")])
+def test_camera_that_raises_no_usual_exception_is_a_fault_and_logged(process, link, monkeypatch, caplog, error):
+    def fail(_):
+        raise error
+
+    monkeypatch.setattr(network_process, "_CAMERA_RETRY_S", 0.0)
+    monkeypatch.setattr(process.camera, "read", fail, raising=False)
+    process._stream_one()
+    fault = f"camera raised {type(error).__name__}: {error}"
+    assert process._camera_fault == fault and fault in caplog.text
+    monkeypatch.undo()
+    process._stream_one()
+    assert FRAME in link.published and not process._camera_fault
 
 
 @pytest.mark.parametrize(("now_us", "slept_s", "waited_s"), [
