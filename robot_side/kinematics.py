@@ -75,6 +75,10 @@ class Odometer:
         self._last = wheels
         self._update_rate(wheels)
 
+    def restart(self, wheels: WheelAngles) -> None:
+        """Continue at the same pose from this reading. The difference to earlier readings does not count."""
+        self._last = self._rate_from = wheels
+
     def _advance(self, left_rad: float, right_rad: float) -> None:
         arc = twist_of(self._drive, left_rad, right_rad)  # angles instead of speeds: meters and radians, not per second
         half = arc.angular_rad_s / 2
@@ -109,6 +113,8 @@ class WheelMonitor:
     def __init__(self, max_rad_s: float) -> None:
         """Begin. `max_rad_s`: highest commanded speed. Pushed or downhill, a wheel may be twice as fast."""
         self._max_rad_s = 2 * max_rad_s
+        self.jumped = False
+        """True if the last reading was further from the one before than a wheel can turn."""
         self._last: tuple[float, int] | None = None
         self._from_rad = self._commanded_rad = 0.0
         self._since_us = 0
@@ -126,8 +132,8 @@ class WheelMonitor:
         self._last = (angle_rad, t_us) if t_us > last_us or self._last is None else self._last
         step_rad, step_us = abs(self._last[0] - last_rad), max(self._last[1] - last_us, _AT_ONCE_US)
         self._commanded_rad += commanded_rad
-        jumped = step_rad > self._max_rad_s * step_us / 1e6 + _STEP_RAD
-        doubt = f"jumped by {step_rad:.3g} rad; look for a loose wire, or a counter that wraps" if jumped else ""
+        self.jumped = step_rad > self._max_rad_s * step_us / 1e6 + _STEP_RAD
+        doubt = f"jumped by {step_rad:.3g} rad; look for a loose wire, or a counter that wraps" if self.jumped else ""
         if not doubt and now_us - self._since_us >= _COMPARED_US and abs(self._commanded_rad) >= math.tau:
             doubt = self._compared(self._last[0] - self._from_rad)
         elif not doubt and commanded_rad * self._commanded_rad > 0:
@@ -150,6 +156,11 @@ class EncoderMonitor:
     def __init__(self, drive: DiffDriveConfig) -> None:
         self._monitors = WheelMonitor(drive.max_wheel_rad_s), WheelMonitor(drive.max_wheel_rad_s)
         self._looked_us: int | None = None
+
+    @property
+    def jumped(self) -> bool:
+        """Return True if a wheel of the last reading jumped."""
+        return any(monitor.jumped for monitor in self._monitors)
 
     def look(self, speeds: tuple[float, float], wheels: WheelAngles, now_us: int) -> str:
         """Return what is doubtful, with the side, or "".

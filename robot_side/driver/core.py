@@ -156,9 +156,9 @@ class DriverCore:
         if wheels is not None:
             if (ahead_us := wheels.t_us - now_us) > _AHEAD_US:
                 raise ValueError(f"WheelAngles.t_us is {ahead_us / 1e6:.3g} s ahead; take the robot's clock")
-            self.odometer.update(wheels)
             speeds = wheel_speeds(self.config.wheels, self.gate.applied)
             self.doubtful_wheel = self._encoders.look(speeds, wheels, now_us)
+            (self.odometer.restart if self._encoders.jumped else self.odometer.update)(wheels)
         if scan is not None:
             self._on_scan(scan, now_us)
         decision = self.gate.step(now_us)

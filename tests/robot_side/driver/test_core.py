@@ -210,6 +210,23 @@ def test_tick_compares_the_encoders_with_the_speeds_of_the_tick_before():
     assert core.doubtful_wheel == ""
 
 
+@pytest.mark.parametrize("side", [0, 1])
+@pytest.mark.parametrize("jump_rad", [-1e6, -10.0, 10.0, 1000.0])
+@pytest.mark.parametrize("back_at", [13, 99])
+def test_jump_of_an_encoder_does_not_enter_the_odometry(side, jump_rad, back_at):
+    """A counter that wraps does not come back, a loose wire does. The next steps count."""
+    cores = core_of(), core_of()
+    for step in range(40):
+        now_us, angles = NOW_US + step * 20_000, [0.04 * step, 0.05 * step]
+        cores[0].tick(now_us, WheelAngles(*angles, now_us), None)
+        angles[side] += jump_rad * (10 <= step < back_at)
+        cores[1].tick(now_us, WheelAngles(*angles, now_us), None)
+        true, jumped = (core.motion() for core in cores)
+        assert jumped.pose == pytest.approx(true.pose, abs=0.015)
+        assert jumped.moving == pytest.approx(true.moving)
+    assert true.pose[0] > 0.07
+
+
 def test_tick_reads_the_wheels_and_the_motion_is_bounded():
     core = core_of()
     assert core.motion() == RobotMotion() and core.at_rest
