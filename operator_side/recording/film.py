@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 import time
@@ -203,13 +204,13 @@ def record(link: Link, pictures: Pictures, path: Path, wanted: Channel, seconds:
     """Write the messages of `seconds`, or until Ctrl-C, SIGTERM or SIGHUP, to `path`. `wanted` may add the overlay.
 
     A file that is there already stays until then. Raises LinkError if none arrives, ConfigError for a file that cannot
-    be written to its end.
+    be written to its end, or that another recording writes.
     """
     target = Path(os.path.realpath(path))
     beside = whole(target, MESSAGES) if target.is_file() else nullcontext(target)
     ends_s, has_begun = time.monotonic() + PATIENCE_S, False  # the end is counted from the first message
     channels = dict.fromkeys((*RECORDED, wanted))
-    with _terminated_like_ctrl_c(), writes(path), beside as part:
+    with _terminated_like_ctrl_c(), writes(path), _locked(target), beside as part:
         with Recorder(link, part, {"robot": link.robot}, channels) as recorder, suppress(KeyboardInterrupt):
             while (left_s := ends_s - time.monotonic()) > 0 and not recorder.failed:
                 pictures.take(min(left_s, _WAIT_S))  # it acknowledges frames; without a vision service no client does
@@ -221,6 +222,21 @@ def record(link: Link, pictures: Pictures, path: Path, wanted: Channel, seconds:
     if recorder.failed:
         raise ConfigError(f"recording {path} ends early: {recorder.failed}; free some space or name another file")
     return recorder
+
+
+@contextmanager
+def _locked(target: Path) -> Iterator[None]:
+    """Lock the file of a recording, because a second one would replace it. Raises ConfigError if it is locked."""
+    number = os.open(target, os.O_RDONLY | os.O_CREAT, 0o666)
+    try:
+        with suppress(OSError):  # a file system without locks
+            try:
+                fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ConfigError(f"cannot write {target}: another recording writes it; name another file") from None
+        yield
+    finally:
+        os.close(number)
 
 
 def _fill(made: Film, pictures: Pictures, wanted: Channel, seconds: float) -> Cut:

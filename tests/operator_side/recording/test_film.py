@@ -1,5 +1,6 @@
 """Films and snapshots: what ends them, and a full disk, which is one line and leaves no unfinished file."""
 
+import errno
 import json
 import os
 import re
@@ -320,6 +321,33 @@ def test_recording_replaces_an_earlier_one_only_if_it_has_messages(monkeypatch, 
     record(robot, robot, link, FRAME, 0.01)
     assert [one.message for one in read_recording(path)] == [status(1)]
     assert link.is_symlink() and set(tmp_path.iterdir()) == {path, link}
+
+
+@pytest.mark.parametrize("earlier", [b"", b"earlier", None])
+def test_second_recording_of_one_file_is_rejected_and_the_first_is_complete(tmp_path: Path, earlier) -> None:
+    path = tmp_path / "run.mcap"
+    if earlier is not None:
+        path.write_bytes(earlier)
+
+    def record_again() -> None:
+        with pytest.raises(ConfigError, match=f"cannot write {path}: another recording writes it; name another file"):
+            record(Talking([status(9)]), Talking([status(9)]), path, FRAME, 0.01)
+
+    robot = Talking([status(1)], [record_again], [status(2)])
+    record(robot, robot, path, FRAME, 0.1)
+    assert [one.message for one in read_recording(path)] == [status(1), status(2)]
+    assert list(tmp_path.iterdir()) == [path]
+    record(robot := Talking([status(3)]), robot, path, FRAME, 0.01)
+    assert [one.message for one in read_recording(path)] == [status(3)]
+
+
+def test_recording_needs_no_locks_of_the_file_system(monkeypatch, tmp_path: Path) -> None:
+    def without_locks(*_given) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr("fcntl.flock", without_locks)
+    robot = Talking([status(1)])
+    assert record(robot, robot, tmp_path / "run.mcap", FRAME, 0.01).counts == {"status": 1}
 
 
 def test_recording_has_its_length_from_the_first_message_on(tmp_path: Path) -> None:
