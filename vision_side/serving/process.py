@@ -4,10 +4,12 @@ import logging
 import os
 import signal
 import socket
+import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import Final
 
@@ -22,7 +24,14 @@ from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.missions.registry import configured_mission
 from sightline.vision_side.pipeline import SOURCE
 from sightline.vision_side.serving.legacy_robot import LegacyRobotLink, is_legacy
-from sightline.vision_side.serving.service import LogLine, Observe, ServingState, endpoints_text, open_service
+from sightline.vision_side.serving.service import (
+    LIVE_S,
+    LogLine,
+    Observe,
+    ServingState,
+    endpoints_text,
+    open_service,
+)
 
 _log: Final = logging.getLogger(__name__)
 
@@ -85,6 +94,42 @@ def _has_hanging_thread(until_s: float) -> bool:
     return any(one.is_alive() for one in others)
 
 
+_LOOK_S = 1.0  # time between two looks at the turns of the loop
+_PYTHON = str(Path(os.__file__).parent)
+
+
+def watch_turns(state: ServingState, report: LogLine) -> threading.Thread:
+    """Start to log each turn of this thread that lasts LIVE_S, with the line of code that hangs, and its end."""
+    watching = threading.Thread(
+        target=_report_hangs, args=(state, threading.get_ident(), report), name="turns", daemon=True)
+    watching.start()
+    return watching
+
+
+def _report_hangs(state: ServingState, thread: int, report: LogLine) -> None:
+    # It counts looks, not seconds, because a process that was suspended does not hang.
+    looks, most, turned_s = 0, round(LIVE_S / _LOOK_S), state.turned_s
+    while not state.ending.wait(_LOOK_S):
+        if state.turned_s == turned_s:
+            looks += 1
+            if looks == most:
+                report(f"vision: no turn ended for {looks * _LOOK_S:g} s: it hangs in {_place(thread)}")
+            continue
+        if looks >= most:
+            report(f"vision: the turn ended after {looks * _LOOK_S:g} s")
+        looks, turned_s = 0, state.turned_s
+
+
+def _place(thread: int) -> str:
+    """Return the innermost function of a thread that is not part of Python, with its file and line."""
+    frame = sys._current_frames()[thread]
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_PYTHON):
+        if "-packages" in frame.f_code.co_filename:
+            break
+        frame = frame.f_back
+    return f"{frame.f_code.co_qualname}() of {frame.f_code.co_filename}:{frame.f_lineno}"
+
+
 def run(config: VisionConfig, observe: Observe | None = None) -> int:
     """Serve until SIGTERM or SIGINT. Returns the exit code 0. `observe` receives the state.
 
@@ -94,19 +139,25 @@ def run(config: VisionConfig, observe: Observe | None = None) -> int:
 
     configured_mission(config)  # an unknown mission must fail before any endpoint is opened
     ending, detector = threading.Event(), configured_detector(config)
+
+    def observed(state: ServingState) -> None:
+        watch_turns(state, _log.warning)
+        if observe is not None:
+            observe(state)
+
     if problem := date_problem(config.secure, SOURCE):
         _log.warning("vision: %s", problem)
     run_it = _run_fleet if set("*?") & set(config.robot) or config.share.enabled else _run_one
     with ExitStack() as guard:  # also around the end of the link and of the detector
         try:
             with limit_floods(config.listen, lambda line: _log.info("vision: %s", line)):
-                return run_it(config, ending, observe, detector, guard)
+                return run_it(config, ending, observed, detector, guard)
         finally:
             close_detector(detector)
 
 
 def _run_one(
-    config: VisionConfig, ending: threading.Event, observe: Observe | None, detector: Detector, guard: ExitStack
+    config: VisionConfig, ending: threading.Event, observe: Observe, detector: Detector, guard: ExitStack
 ) -> int:
     from sightline.protocol.transports.open import open_link
 
@@ -129,7 +180,7 @@ def _run_one(
 
 
 def _run_fleet(
-    config: VisionConfig, ending: threading.Event, observe: Observe | None, detector: Detector, guard: ExitStack
+    config: VisionConfig, ending: threading.Event, observe: Observe, detector: Detector, guard: ExitStack
 ) -> int:
     from sightline.protocol.transports.zenoh.link import open_fleet
     from sightline.vision_side.serving.fleet import Fleet, SharedFleet
