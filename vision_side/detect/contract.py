@@ -4,7 +4,9 @@ A seed defines the images: disks and boxes in all colors, noise, black, odd size
 """
 
 import math
+import queue
 import re
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -28,6 +30,8 @@ from sightline.vision_side.detect.port import NO_DEADLINE, NORMALIZED_PX, Detect
 SIZES: Final = ((320, 240), (640, 480), (97, 61), (16, 16), (1280, 720), (641, 481))
 LATE_S: Final = 0.25
 """Longest delay of an answer after the deadline of its frame. By then the caller no longer waits."""
+MOST_S: Final = 120.0
+"""Longest time for one promise, that is 2.5 s for each of its images."""
 _MAX_PIXELS: Final = 1920 * 1080
 _FRAME_US: Final = 33_333
 _QUALITY: Final = 80
@@ -35,6 +39,7 @@ _HASH = re.compile(r"[0-9a-f]{0,64}")
 _SAME_SCORE: Final = 0.5  # on a device that rounds, less certain detections may come and go
 
 Make = Callable[[], Detector]
+_Check = Callable[[Detector, Make, int], str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +64,27 @@ class Times:
 
 
 def check_detector(make: Make, seed: int = 1) -> list[PromiseResult]:
-    """Check every promise in turn. `make` builds a new detector."""
+    """Check every promise in turn, until one takes `MOST_S`. `make` builds a new detector."""
     verdicts = []
     for check in _CHECKS:
         promise = (check.__doc__ or "").split("\n")[0].rstrip(".")
+        ended = queue.SimpleQueue[str | BaseException]()
+        threading.Thread(target=_check, args=(ended, check, make, seed), name="check", daemon=True).start()
+        try:
+            wrong, hangs = ended.get(timeout=MOST_S), False
+        except queue.Empty:  # the next promise would wait as long
+            wrong, hangs = f"it takes more than {MOST_S:g} s; the rest was not checked", True
+        if isinstance(wrong, BaseException):
+            raise wrong
+        verdicts.append(PromiseResult(check.__name__.removeprefix("_keeps_"), promise, wrong))
+        if hangs:
+            break
+    return verdicts
+
+
+def _check(ended: "queue.SimpleQueue[str | BaseException]", check: "_Check", make: Make, seed: int) -> None:
+    """Put the violation of one promise, or the error of building or closing the detector, into `ended`."""
+    try:
         detector = make()
         try:
             wrong = check(detector, make, seed)
@@ -70,8 +92,9 @@ def check_detector(make: Make, seed: int = 1) -> list[PromiseResult]:
             wrong = f"it raises {type(error).__name__}: {report_fault('detector', error)}"[:160]
         finally:
             close_detector(detector)
-        verdicts.append(PromiseResult(check.__name__.removeprefix("_keeps_"), promise, wrong))
-    return verdicts
+        ended.put(wrong)
+    except PLUGIN_ERRORS as error:
+        ended.put(error)
 
 
 def time_detector(make: Make, frames: int = 60, seed: int = 1) -> list[Times]:

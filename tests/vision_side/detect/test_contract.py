@@ -1,13 +1,16 @@
 """The contract kit: our own detectors keep every promise, and each broken one is found out by the promise it breaks."""
 
+import threading
 import traceback
 from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
 
+from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import MAX_DETECTED_BOXES
 from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect import contract
 from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.contract import check_detector
 from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, TrackIds
@@ -199,3 +202,27 @@ def test_author_sees_the_line_that_raises(caplog) -> None:
     check_detector(Raising, 3)
     (raised,) = [record.exc_info[2] for record in caplog.records]
     assert "one.picture()" in [frame.line for frame in traceback.extract_tb(raised)]
+
+
+@pytest.mark.parametrize("place", ["__init__", "detect", "close"])
+def test_detector_that_hangs_breaks_the_promise_and_ends_the_check(monkeypatch, place: str) -> None:
+    monkeypatch.setattr(contract, "MOST_S", 0.05)
+    left, began = threading.Event(), []
+
+    def hang(*_given: object) -> None:
+        began.append(place)
+        left.wait(5)
+
+    (result,) = check_detector(type("Hanging", (Broken,), {place: hang}), 3)
+    assert (result.name, result.wrong) == ("order", "it takes more than 0.05 s; the rest was not checked")
+    assert began == [place]
+    left.set()
+
+
+@pytest.mark.parametrize("error", [ConfigError("no such file"), OSError("no device"), SystemExit("3")])
+def test_error_of_building_a_detector_ends_the_check(error: BaseException) -> None:
+    def make() -> Broken:
+        raise error
+
+    with pytest.raises(type(error), match=str(error)):
+        check_detector(make, 3)
