@@ -28,14 +28,16 @@ from sightline.protocol.messages import (
 from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import Message
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.detect.registry import configured_detector
+from sightline.vision_side.detect.registry import configured_detector, waits_for_service
 from sightline.vision_side.missions.ranges import decode_scan
 from sightline.vision_side.missions.registry import requested_mission
-from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline, PipelineAnswer
+from sightline.vision_side.pipeline import NO_ANSWER, SOURCE, Frame, Observation, Pipeline, PipelineAnswer
 from sightline.vision_side.tracking.locate import BoxReader
 
 VISION_CONFIG = "vision_config"
 """Metadata key of the vision configuration, as JSON."""
+
+_NO_ANSWER = Observation("no answer")
 
 _FrameId = tuple[str, int]
 
@@ -155,7 +157,9 @@ def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
                 pipelines[header.session] = Pipeline(config, camera, detector)
             pipeline = pipelines[header.session]
             _give(pipeline, header, answers, config)
-            if config.detector.kind == "boxes":
+            if sent is None and waits_for_service(config):  # the answer was late, and now it may be in time
+                yield Step(frame, None, pipeline.acknowledge(_NO_ANSWER, NO_ANSWER))
+            elif config.detector.kind == "boxes":
                 found = answers.boxes.get((frame.header.session, frame.header.seq))
                 if sent is not None and found is not None:  # an acknowledgment shows that the frame arrived
                     yield Step(frame, sent, _by_boxes(pipeline, frame, found, camera, config))

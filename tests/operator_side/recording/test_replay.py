@@ -12,7 +12,8 @@ from sightline.protocol.messages import AnswerHeader, Stamp
 from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario
 from sightline.sim.world.world import World
-from sightline.vision_side.config import MissionConfig
+from sightline.vision_side.config import DetectorConfig, MissionConfig
+from sightline.vision_side.detect.color.detectors import Hsv
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 from tests.operator_side.recording.test_recorder import record
 from tests.vision_side.serving.test_mission_channel import FRAME_US, GOTO, MODEL, Bench, scan
@@ -94,6 +95,33 @@ def test_mission_with_scans_is_repeated_exactly(tmp_path):
     assert len(set(scans)) > 25 and scans == sorted(scans)
     result = replay(path)
     assert result.ok and result.total > 60, result
+
+
+class Remote(Hsv):
+    """A detector that waits for another service, which is sometimes late. It is never late in a replay."""
+
+    waits = True
+    late = 0
+
+    def detect(self, frames, deadline_us):
+        Remote.late = max(0, Remote.late - 1)
+        return [None] * len(frames) if Remote.late else super().detect(frames, deadline_us)
+
+
+@pytest.mark.parametrize("late", [1, 2, 7])
+def test_frame_of_a_late_remote_detector_is_acknowledged_again(monkeypatch, tmp_path, late):
+    detector = DetectorConfig(kind=f"{__name__}:Remote", deadline_s=1.0)
+    path, config = tmp_path / "run.mcap", GOTO.model_copy(update={"detector": detector, "mission": MissionConfig()})
+    bench = Bench(config=config)
+    bench.image = jpeg_of(scene(MODEL, 1.1, 0.1, shaded=True))
+    with Recorder(bench.network.link("r1"), path, {VISION_CONFIG: config.model_dump_json()}):
+        show_camera(bench, MODEL)
+        bench.frames(5)
+        monkeypatch.setattr(Remote, "late", late + 1)
+        bench.frames(late + 5)
+    steps = list(replay_steps(path))
+    assert [step.sent is None for step in steps] == [*[False] * 5, *[True] * late, *[False] * 5]
+    assert replay(path).ok and {step.answer.skipped for step in steps} == {"", "NO_ANSWER"}
 
 
 def test_twist_that_was_sent_twice_is_computed_once(tmp_path):
