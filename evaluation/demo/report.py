@@ -194,7 +194,7 @@ def summary(scored: DemoReport) -> list[str]:
     lines = check_lines(scored.checks)
     if not bounds_of(run.scenario, run.options.latency_ms):
         lines.append(NOT_EVALUATED)
-    lines.append(_replay_line(replayed))
+    lines.append(_replay_line(replayed, _loss_fix(run)))
     if run.dropped_by_recorder:
         lines.append(f"the recorder dropped {run.dropped_by_recorder} messages: the disk was too slow")
     if run.killed:
@@ -211,12 +211,19 @@ def _detector_lines(log: Path) -> list[str]:
     return [f"detector: {line}" for line in list(notices)[:MOST_NOTICES]]
 
 
-def _replay_line(replayed: Replayed) -> str:
+def _loss_fix(run: DemoRun) -> str:
+    """Return how to record all messages, by the cause of the missing ones."""
+    if run.dropped_by_recorder:
+        return "use a faster disk: --out DIR"
+    return "run without loss to compare" if run.options.loss else "the machine was too busy; close other programs"
+
+
+def _replay_line(replayed: Replayed, fix: str) -> str:
     if not replayed.total:
         return "replay: vision's answers did not cross the recorder's transport, so there is nothing to compare"
     if replayed.gaps or replayed.missing_frames:
         lost = f"{replayed.gaps} answers and {replayed.missing_frames} frames are not in the recording"
-        return f"replay: cannot be compared, for {lost}; run without loss to compare"
+        return f"replay: cannot be compared, for {lost}; {fix}"
     return f"replay: {replayed.equal} of {replayed.total} answers equal byte for byte"
 
 

@@ -117,6 +117,20 @@ def test_loss_may_stop_the_robot_once_a_minute(lights, options, seconds, holds, 
     assert next((check.ok for check in checks if check.name == "holds"), None) is ok
 
 
+@pytest.mark.parametrize(("dropped", "loss", "fix"), [
+    (0, 0.1, "run without loss to compare"), (0, 0.0, "the machine was too busy; close other programs"),
+    (3, 0.0, "use a faster disk: --out DIR"), (3, 0.1, "use a faster disk: --out DIR"),
+])
+@pytest.mark.parametrize("missing", [{"gaps": 2}, {"missing_frames": 4}])
+def test_summary_names_how_to_record_the_missing_messages(lights, dropped, loss, fix, missing):
+    driven = replace(lights, dropped_by_recorder=dropped, options=replace(lights.options, loss=loss))
+    replayed = Replayed(total=9, equal=9, **missing)
+    lines = demo_report.summary(demo_report.DemoReport(driven, None, [], replayed, None))
+    (line,) = [line for line in lines if line.startswith("replay: ")]
+    assert line == (f"replay: cannot be compared, for {replayed.gaps} answers and {replayed.missing_frames} frames are "
+                    f"not in the recording; {fix}")
+
+
 def test_summary_shows_what_the_detector_reported_each_line_once_and_the_first_three(lights):
     judged = demo_report.report(lights)
     before = demo_report.summary(judged)
