@@ -104,21 +104,25 @@ class PluginRegistry:
         """Return every name that `load` accepts."""
         return sorted(_entries(self.group))
 
-    def load(self, kind: str) -> Any:
-        """Import the plug-in `kind`. Raises ConfigError, one line, for an unknown or a broken plug-in."""
+    def load(self, kind: str, *, takes_classes: bool = True) -> Any:
+        """Import the plug-in `kind`, or with `takes_classes` also the class `package.module:Name`.
+
+        Raises ConfigError, one line, for an unknown or a broken plug-in.
+        """
         entry = _entries(self.group).get(kind)
         try:
             with _old_packages_missing():
                 if entry is not None:
                     return entry.load()
-                if _CLASS.fullmatch(kind):
+                if takes_classes and _CLASS.fullmatch(kind):
                     return _imported(kind)
         except PLUGIN_ERRORS as error:  # from the import of a plug-in
             if not isinstance(error, ImportError | AttributeError):  # these errors name the missing part
                 report_ending(self.noun, error)
             hint = "" if entry is not None else self._hint(kind)
             raise ConfigError(f"{self.noun} {kind!r} cannot be loaded: {_why(error, kind)}{hint}") from None
-        there = f"there are {', '.join(sorted((*self.names(), *self.also)))}, or package.module:Name"
+        there = f"there are {', '.join(sorted((*self.names(), *self.also)))}"
+        there += ", or package.module:Name" if takes_classes else ""
         raise ConfigError(f"no {self.noun} called {kind!r}{self._hint(kind)}; {there}")
 
     def _hint(self, kind: str) -> str:

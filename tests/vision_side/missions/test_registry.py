@@ -99,6 +99,14 @@ def test_invalid_choice_gives_one_line_with_the_reason(kind, options, words):
     assert words in str(error.value) and len(str(error.value).splitlines()) == 1
 
 
+@pytest.mark.parametrize("name", ["folow", "zzz", f"{__name__}:Raising", "no_such_package:Name"])
+def test_requested_mission_names_no_class_and_none_is_offered(name):
+    request = MissionRequest.model_construct(id=1, name=name, options={}, waypoints=())
+    with pytest.raises(ConfigError, match=f"^no mission called {name!r}") as error:
+        requested_mission(request, CONFIG)
+    assert str(error.value).endswith("traffic-light, traffic-light-boxes")
+
+
 def test_an_entry_point_gives_a_mission_its_name(monkeypatch):
     shy = EntryPoint("shy", "examples.my_mission:Shy", REGISTRY.group)
     broken = EntryPoint("broken", "examples.nothing:There", REGISTRY.group)
