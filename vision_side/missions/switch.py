@@ -102,6 +102,8 @@ class MissionSwitch:
 
 def _usable(plan: Plan) -> Plan:
     """Convert a plan to types that report and log accept. Raises TypeError or ValueError for an invalid plan."""
+    if not isinstance(plan, Plan):  # e.g. None, if `step` lacks its return
+        raise TypeError(f"step() returned {type(plan).__name__}, not a Plan")
     for name, kind in _TYPES.items():
         if not isinstance(getattr(plan, name), kind):
             raise TypeError(f"returned a {name} of type {type(getattr(plan, name)).__name__}")
