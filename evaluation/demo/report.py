@@ -2,6 +2,10 @@
 
 import json
 import math
+import re
+import shlex
+import shutil
+import sys
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -199,9 +203,20 @@ def summary(scored: DemoReport) -> list[str]:
         lines.append(f"the recorder dropped {run.dropped_by_recorder} messages: the disk was too slow")
     if run.killed:
         lines.append(f"had to be killed: {', '.join(run.killed)}; see their logs")
+    if scored.ok is False:
+        lines += _late_lines(run.folder / "sim.log")
     lines += _detector_lines(run.folder / "vision.log")
     lines.append(f"left in {run.folder}: score.json trajectory.png run.mp4 run.mcap motors.csv *.log")
     return [*lines, _next_thing(run)]
+
+
+def _late_lines(log: Path) -> list[str]:
+    """Return a line if the simulation was behind the clock: a busy machine makes a robot slow that works."""
+    with suppress(FileNotFoundError):
+        if lags_ms := re.findall(r"simulation is (\d+) ms behind the clock", log.read_text("utf-8", "replace")):
+            worst_ms = max(map(int, lags_ms))
+            return [f"the simulation was up to {worst_ms} ms behind the clock; end other programs and repeat"]
+    return []
 
 
 def _detector_lines(log: Path) -> list[str]:
@@ -229,8 +244,11 @@ def _replay_line(replayed: Replayed, fix: str) -> str:
 
 def _next_thing(run: DemoRun) -> str:
     options = run.options
+    # `make demo` starts a command that the shell of the user does not find.
+    is_found = shutil.which("sightline") or Path(sys.argv[0]).name != "sightline"
+    demo = f"next: {'sightline' if is_found else shlex.quote(sys.argv[0])} demo"
     if not options.latency_ms and not options.loss:
         chosen = f" --detector {options.detector}" if options.detector else ""
-        return f"next: sightline demo --scenario {options.scenario}{chosen} --latency-ms 100 --loss 0.1"
+        return f"{demo} --scenario {options.scenario}{chosen} --latency-ms 100 --loss 0.1"
     other = "pushed" if run.scenario.name == "eight" else "eight"
-    return f"next: sightline demo --scenario {other} --latency-ms {options.latency_ms:g} --loss {options.loss:g}"
+    return f"{demo} --scenario {other} --latency-ms {options.latency_ms:g} --loss {options.loss:g}"

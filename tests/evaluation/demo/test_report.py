@@ -6,6 +6,7 @@ import json
 import os
 import resource
 import shutil
+import sys
 import tomllib
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -57,6 +58,11 @@ def lights(tmp_path_factory) -> DemoRun:
     rows = [f"{t_us},{left / RADIUS_M},{right / RADIUS_M},0,0" for t_us, left, right in lockstep.run.wheels]
     (folder / MOTOR_LOG).write_text("\n".join(["header", *rows, ""]))
     return DemoRun(DemoOptions("traffic-light"), scenario, folder, lockstep.run.samples)
+
+
+@pytest.fixture(scope="module")
+def scored(lights) -> demo_report.DemoReport:
+    return demo_report.report(lights)
 
 
 def misread(driven: DemoRun):
@@ -145,6 +151,34 @@ def test_summary_shows_what_the_detector_reported_each_line_once_and_the_first_t
         log.write_text("")
     told = [f"detector: the color range marks {share} %" for share in (0, 1, 2)]
     assert after == [*before[:-2], *told, *before[-2:]]
+
+
+@pytest.mark.parametrize(("lags_ms", "ok", "worst_ms"), [
+    ((), False, None), ((130, 582, 147), True, None), ((130, 582, 147), False, 582), ((101,), False, 101),
+    ((1000, 999), False, 1000),
+])
+def test_summary_of_a_failed_run_shows_how_late_the_simulation_was(scored, tmp_path, lags_ms, ok, worst_ms):
+    (tmp_path / "vision.log").touch()
+    lags = [f"simulation is {lag} ms behind the clock; is the machine busy?" for lag in lags_ms]
+    lines = [f"2026-03-01T10:00:00.000Z info {line}\n" for line in ("simulation ready: circle", *lags)]
+    (tmp_path / "sim.log").write_text("".join(lines))
+    checks = [replace(check, ok=ok) for check in scored.checks]
+    ended = replace(scored, run=replace(scored.run, folder=tmp_path), checks=checks)
+    late = [line for line in demo_report.summary(ended) if "behind the clock" in line]
+    busy = f"the simulation was up to {worst_ms} ms behind the clock; end other programs and repeat"
+    assert late == ([] if worst_ms is None else [busy])
+
+
+@pytest.mark.parametrize(("found", "started_as", "shown"), [
+    ("/usr/bin/sightline", "/usr/bin/sightline", "sightline"), (None, ".venv/bin/sightline", ".venv/bin/sightline"),
+    (None, "/my clone/bin/sightline", "'/my clone/bin/sightline'"), (None, "cli/app.py", "sightline"),
+])
+@pytest.mark.parametrize("latency_ms", [0.0, 50.0])
+def test_next_command_works_where_the_demo_was_started(scored, monkeypatch, found, started_as, shown, latency_ms):
+    monkeypatch.setattr(shutil, "which", lambda _name: found)
+    monkeypatch.setattr(sys, "argv", [started_as, "demo"])
+    driven = replace(scored.run, options=replace(scored.run.options, latency_ms=latency_ms))
+    assert demo_report.summary(replace(scored, run=driven))[-1].startswith(f"next: {shown} demo --scenario ")
 
 
 def test_results_are_printed_before_files_that_cannot_be_written(lights, tmp_path, monkeypatch, capsys):
