@@ -113,6 +113,11 @@ class Robot:
         recent = {name: [one for one in series if since_us <= one.t_us <= until_us] for name, series in found.items()}
         return {name: series for name, series in recent.items() if series}
 
+    def frames_give_a_pose(self) -> bool:
+        """Return True if the newest frame states `pose`."""
+        frames = self.frames()
+        return bool(frames) and "pose" in frames[-1][1].model_fields_set
+
     def evidence_of_motion(self, since_us: int = 0) -> Evidence | None:
         """Return the newest evidence from odometry, frames or motor log that it moved after this time of its clock."""
         rows = self.bench.motor_rows()

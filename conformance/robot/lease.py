@@ -22,6 +22,8 @@ from sightline.protocol.proof import ProofChain
 
 SUITE: Final = Suite("R")
 _LEASE_US: Final = 1_000_000
+_STALE_US: Final = 500_000
+"""Above the greatest age of a frame."""
 _NOTICED_US: Final = 300_000
 """From the end of a lease until a `status` (10 Hz) shows it, with room for a slow machine."""
 _TOKEN_US: Final = 100_000
@@ -115,13 +117,17 @@ def lease_lasts(bench: Bench) -> None:
 
 @SUITE.must("R-LEASE-06", "6.1 Lease", _held_for_a_while)
 def rejected_twists_renew_nothing(bench: Bench, first: Sender) -> None:
-    """Rejected twists of the holder do not renew its lease."""
+    """Rejected twists of the holder do not renew its lease: of an unknown frame, out of order, and too old."""
     first.need_unknown()
     first.need_good()
     first.acks = False
+    old, began_us = first.robot.frame(), bench.now_us
     for _ in range(7):
         frame = first.robot.frame()
         first.twist(frame, echo_seq=frame.seq + 5000)
+        first.twist(frame, seq=1)
+        if bench.now_us - began_us > _STALE_US:
+            first.twist(old)
         bench.rest(200_000)
     Sender(first.robot).expect(GOOD, what="after 1.4 s of rejected twists a second driver")
 
@@ -343,6 +349,23 @@ def too_many_lost_commands(_bench: Bench, first: Sender) -> None:
     for _ in range(64):
         first.proofs.next()
     _expect_while_held("NOT_PROVEN", first, first)
+
+
+@SUITE.must("R-PROOF-14", "6.6 Proof", vision)
+def acquire_commits(bench: Bench, first: Sender) -> None:
+    """The proof of an `acquire` that takes the lease is a commitment: a twist with another proof is NOT_PROVEN."""
+    bench.need(first.granted("acquire") and _holder_is(first), "acquire takes no lease (R-LEASE-13)")
+    bench.expect((result := first.twist_result(proof=_FORGED)) == "NOT_PROVEN", f"the twist: {result}")
+
+
+@SUITE.must("R-PROOF-15", "6.6 Proof", ready)
+def request_uses_up_its_proof(bench: Bench, first: Sender) -> None:
+    """The proof of a granted request is the last one accepted: a twist that repeats it is NOT_PROVEN."""
+    for verb in ("reset", "acquire"):
+        used = first.proofs.next().proof
+        bench.need(first.granted(verb, proof=used), f"{verb} is not granted (R-LEASE-13)")
+        _expect_while_held("NOT_PROVEN", first, first, f"a twist with the proof of {verb}", proof=used)
+        first.need_good()
 
 
 @SUITE.must("R-PROOF-06", "6.6 Proof", ready)

@@ -65,12 +65,14 @@ def measures_what_it_applies(bench: Bench) -> None:
         robot, (_status, applied) = Robot(bench), _driven(bench, text)
         began_us = robot.clock_us()
         bench.rest(800_000)
-        readings = robot.readings(began_us)
-        found = {"moving": mean_moving(readings), "pose": mean_travel(readings)}
+        found = {f"{field} of {name}": mean({name: series}) for name, series in robot.readings(began_us).items()
+                 for field, mean in (("moving", mean_moving), ("pose", mean_travel))}
         bench.need(any(found.values()), "this robot publishes no measured motion")
+        frozen = found.get("pose of odometry") and not found.get("pose of frame") and robot.frames_give_a_pose()
+        bench.expect(not frozen, "`pose` of the frames stands still, that of odometry does not")
         for name, measured in found.items():
             near = measured is None or all(map(_agrees, measured, applied, (_OFF_MPS, _OFF_RAD_S)))
-            bench.expect(near, f"{text.decode()} is applied as {applied}, by `{name}` it moves at {measured}")
+            bench.expect(near, f"{text.decode()} is applied as {applied}, by {name} it moves at {measured}")
         bench.rest(1_000_000 if Sender(robot, "operator").granted("disarm") else 0)
         bench.forget()
 

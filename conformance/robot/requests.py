@@ -245,8 +245,10 @@ def unreadable(bench: Bench, operator: Sender) -> None:
 
 def _cites_unknown_status(operator: Sender) -> None:
     stamp = operator.robot.stamp()
-    unknown = Stamp(session=stamp.session, seq=stamp.seq + 5000, t_us=stamp.t_us)
-    operator.expect_rejected("reset", "UNKNOWN_FRAME", "a status never issued", cite=unknown)
+    for seq, t_us, what in ((stamp.seq + 5000, stamp.t_us, "a status never issued"),
+                            (stamp.seq, stamp.t_us - 1, "a status with `t_us` off by one")):
+        unknown = Stamp(session=stamp.session, seq=seq, t_us=t_us)
+        operator.expect_rejected("reset", "UNKNOWN_FRAME", what, cite=unknown)
 
 
 def _cites_other_session(operator: Sender) -> None:
@@ -273,7 +275,8 @@ SUITE.must_all(operator, {
                  lambda it: it.expect_granted("disarm", "the reply", extra={"colour": "red"}, mood="calm")),
     "R-REQ-11": ("8.3 Freshness", "What lets a robot move again must cite this session of the robot, else "
                  "OTHER_SESSION.", _cites_other_session),
-    "R-REQ-13": ("8.3 Freshness", "`reset` that cites a `status` never issued is rejected as UNKNOWN_FRAME.",
+    "R-REQ-13": ("8.3 Freshness", "`reset` that cites a `status` never issued, or not with that `t_us`, is "
+                 "rejected as UNKNOWN_FRAME.",
                  _cites_unknown_status),
     "R-REQ-14": ("8.3 Freshness", "`reset` that cites a frame in place of a `status` is rejected as MALFORMED.",
                  _cites_frame),
@@ -291,13 +294,17 @@ SUITE.must_all(teleop, {
 
 @SUITE.must("R-STAT-11", "9. Status", operator)
 def counters_never_fall(bench: Bench, operator: Sender) -> None:
-    """The counters in `refused` never decrease, also over STOP and reset."""
-    sender = Sender(operator.robot)
-    sender.need_unknown()
-    before = operator.robot.next_status().refused
+    """`accepted` and the counters in `refused` never decrease, also over STOP and reset."""
+    driver = armed(bench)
+    driver.drive(None)
+    bench.need(operator.robot.stops(2_000_000), "it does not stop (R-SIL-01)")
+    driver.need_unknown()
+    before = operator.robot.next_status()
     operator.send_request("stop")
     bench.need(operator.robot.becomes(State.STOPPED), "STOP does not stop this robot (R-STOP-01)")
     bench.need(operator.granted("reset"), "reset is not granted (R-STOP-06)")
-    after = operator.robot.next_status(2).refused
-    fallen = {name: (count, after.get(name, 0)) for name, count in before.items() if after.get(name, 0) < count}
+    after = operator.robot.next_status(2)
+    counts = {"accepted": (before.accepted, after.accepted)}
+    counts |= {name: (count, after.refused.get(name, 0)) for name, count in before.refused.items()}
+    fallen = {name: pair for name, pair in counts.items() if pair[1] < pair[0]}
     bench.expect(not fallen, f"before STOP and after reset: {fallen}")

@@ -18,7 +18,7 @@ from tests.conformance.clauses import clauses
 from tests.conformance.robot import reference
 from tests.conformance.robot.broken import arming as broken_arming
 from tests.conformance.robot.broken import motion as broken_motion
-from tests.conformance.robot.broken.breaking import bend_out, fields_of
+from tests.conformance.robot.broken.breaking import bend_out, fields_of, wrap
 from tests.conformance.robot.reference import virtual_robot
 
 pytestmark = pytest.mark.computes
@@ -85,6 +85,48 @@ def test_robot_that_shows_a_reduced_command_as_a_rejection_fails():
 
     result = result_of(CASES_BY_ID["R-LIM-05"], lambda robot: bend_out(robot, "status", bend))
     assert (result.outcome, "last_refusal" in result.reason) == (Outcome.FAILED, True), result.reason
+
+
+@pytest.mark.parametrize(("name", "channel", "fields"), [
+    ("R-FRAM-03", "reply", {"session": "0badf00d"}), ("R-SEQ-04", "reply", {"seq": 0}),
+    ("R-SEQ-05", "odometry", {"t_us": 1}), ("R-SEQ-05", "camera", {"t_us": 0}), ("R-SEQ-05", "reply", {"t_us": 2**40})])
+def test_robot_with_a_wrong_stamp_on_one_channel_fails(name, channel, fields):
+    def bend(header, _payload):
+        header.update(fields)
+
+    result = result_of(CASES_BY_ID[name], lambda robot: bend_out(robot, channel, bend))
+    assert result.outcome is Outcome.FAILED, result.reason
+
+
+@pytest.mark.parametrize("pose", [lambda x, y, yaw: [0, 0, 0], lambda x, y, yaw: [x, y, 57.3 * yaw]])
+def test_robot_whose_frames_have_another_pose_than_its_odometry_fails(pose):
+    def bend(header, _payload):
+        header["pose"] = pose(*header["pose"])
+
+    result = result_of(CASES_BY_ID["R-LIM-08"], lambda robot: bend_out(robot, "frame", bend))
+    assert result.outcome is Outcome.FAILED, result.reason
+
+
+@pytest.mark.parametrize("reason", ["OUT_OF_ORDER", "STALE"])
+def test_robot_whose_lease_a_rejected_command_renews_fails(reason):
+    def renews(robot):
+        def around(inner, source, error):
+            holder = robot.driving.gate.holder(robot.now())
+            if error.reason == reason and holder is not None:
+                robot.driving.gate._lease.expires_us = robot.now() + 1_000_000
+            return inner(source, error)
+
+        wrap(robot.driving.gate, "reject", around)
+
+    assert result_of(CASES_BY_ID["R-LEASE-06"], renews).outcome is Outcome.FAILED
+
+
+def test_robot_that_counts_accepted_commands_again_after_a_stop_fails():
+    def bend(_header, payload):
+        payload["accepted"] = 0 if payload["state"] in ("STOPPED", "DISARMED") else payload["accepted"]
+
+    result = result_of(CASES_BY_ID["R-STAT-11"], lambda robot: bend_out(robot, "status", bend))
+    assert (result.outcome, "accepted" in result.reason) == (Outcome.FAILED, True), result.reason
 
 
 @pytest.mark.parametrize(("hashes", "outcome"), [(63, Outcome.FAILED), (64, Outcome.PASSED)])

@@ -304,6 +304,16 @@ def no_proof_will_do(robot):
     proofs_of(robot, lambda lease, who, proof, now_us: proof.proof is None)
 
 
+@breaks("R-PROOF-14")
+def acquire_commits_nothing(robot):
+    wrap(robot.driving.gate, "acquire", lambda inner, who, now_us, _proof: inner(who, now_us))
+
+
+@breaks("R-PROOF-15")
+def requests_use_up_no_proof(robot):
+    lease_of(robot, advance=lambda self, who, proof, now_us: None)
+
+
 @breaks("R-PROOF-13")
 def humans_need_no_proof(robot):
     proofs_of(robot, lambda lease, who, proof, now_us: proof.proof is None and who.source == "teleop")
