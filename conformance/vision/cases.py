@@ -11,14 +11,20 @@ _FIRST_US: Final = 20_000_000
 _AGAIN_US: Final = 3_000_000
 """A vision service that lost its robot in the last case tries again every second."""
 _EVERY_US: Final = 100_000
+_FRAMES_FOR_TWO: Final = 5
 _PARTS: Final = (answers, causality, flow, reports, hostile, websocket)
 
 CASES: Final[tuple[Case, ...]] = tuple(case for part in _PARTS for case in part.SUITE.cases)
 
 
 def is_there(bench: Bench) -> bool:
-    """Return True if a vision service answers. It may be starting."""
+    """Return True if a vision service answers. It may be starting. Raises LinkError if two answer."""
     prepare(bench)
+    robot = RobotPlayed(bench, camera=None)
+    if bench.mark():
+        robot.film("absent", _FRAMES_FOR_TWO)
+        robot.answers()
+    robot.stop()
     return bool(bench.mark() or bench.dropped_here.total())
 
 

@@ -22,6 +22,7 @@ from sightline.conformance.vision.images import CAMERA as LENS
 from sightline.conformance.vision.images import picture
 from sightline.protocol.channels import ACK, CAMERA, FRAME, STATUS, TWIST, Channel
 from sightline.protocol.codec import encode
+from sightline.protocol.errors import LinkError
 from sightline.protocol.messages import CameraModel, FrameHeader, Stamp, State, Status
 
 ANSWER_US: Final = 500_000
@@ -122,6 +123,7 @@ class RobotPlayed:
         self._first_t_us, self._last_t_us, self._next_seq = first_t_us, first_t_us - 1, first_seq
         self._stamps, self._stopped = itertools.count(1), False
         self._answers: list[VisionAnswer] = []
+        self._sessions: list[str] = []
         self._plain: list[Sent] = []
         self._announce_camera()
         self._announce_status()
@@ -197,10 +199,21 @@ class RobotPlayed:
         """Return twists and acks since the start of this robot, or since a mark, in order of arrival."""
         newest = self._answers[-1].received.number if self._answers else 0
         new = [*self.bench.received(TWIST, newest), *self.bench.received(ACK, newest)]
-        self._answers += [read_answer(one) for one in sorted(new, key=lambda one: one.number)]
+        read = [read_answer(one) for one in sorted(new, key=lambda one: one.number)]
+        self._check_one_peer(read)
+        self._answers += read
         del self._answers[: -2 * KEPT_MESSAGES]
         first = bisect_right(self._answers, self._mark if since is None else since, key=lambda one: one.received.number)
         return self._answers[first:]
+
+    def _check_one_peer(self, answers: list[VisionAnswer]) -> None:
+        """Raise LinkError if a session answers again after another one, as two services do that answer each frame."""
+        for session in (str(one.fields["session"]) for one in answers if "session" in one.fields):
+            if session in self._sessions[:-1]:
+                raise LinkError(f"answers of two sessions, {self._sessions[-1]} and {session}, come in turn; end the "
+                                "second vision service, or let the service keep its session (2.5)")
+            if session not in self._sessions:
+                self._sessions.append(session)
 
     def twists(self, since: int | None = None) -> list[VisionAnswer]:
         """Return only the twists."""

@@ -4,14 +4,18 @@ from collections.abc import Sequence
 
 import pytest
 
+from sightline.conformance.benches import TO_ROBOT, VirtualBench
 from sightline.conformance.case import Access, Level
 from sightline.conformance.codec import CASES as CODEC_CASES
 from sightline.conformance.robot.cases import CASES as ROBOT_CASES
 from sightline.conformance.runner import Outcome, passed, run_case
-from sightline.conformance.vision.cases import CASES, prepare
+from sightline.conformance.vision.cases import CASES, is_there, prepare
+from sightline.conformance.vision.fixture import RobotPlayed
 from sightline.protocol.channels import FRAME, STATUS
 from sightline.protocol.codec import decode
+from sightline.protocol.errors import LinkError
 from sightline.protocol.messages import FrameHeader, Stamp
+from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.protocol.transports.websocket.framing import pack
 from sightline.vision_side.pipeline import Observation, PipelineAnswer
 from tests.conformance.clauses import UNTESTED, clauses
@@ -20,7 +24,7 @@ from tests.conformance.vision import broken_flow as vision_broken_flow
 from tests.conformance.vision import broken_inputs as vision_broken_inputs  # noqa: F401
 from tests.conformance.vision import broken_steering as vision_broken_steering
 from tests.conformance.vision.broken import BROKEN, BrokenVision
-from tests.conformance.vision.fixture import BY_BOXES, VirtualVision, reference, virtual_bench
+from tests.conformance.vision.fixture import BY_BOXES, KEYS, VirtualVision, reference, virtual_bench
 
 pytestmark = pytest.mark.computes
 
@@ -181,6 +185,25 @@ def test_vision_service_that_leaves_out_each_nth_frame_fails(nth):
 def test_vision_service_that_steers_by_boxes_of_another_peer_passes(name):
     result = result_of(next(case for case in VIRTUAL if case.id == name), vision_broken_steering.Boxes)
     assert (result.outcome, result.reason) == (Outcome.PASSED, "")
+
+
+def test_two_vision_services_at_one_address_are_reported():
+    network = MemoryNetwork()
+    bench = VirtualBench(network, [VirtualVision(network), VirtualVision(network)], TO_ROBOT, access=KEYS)
+    with pytest.raises(LinkError, match=r"answers of two sessions, \w{8} and \w{8}, come in turn; end the second"):
+        is_there(bench)
+    result = run_case(next(case for case in VIRTUAL if case.id == "V-FRAM-01"), bench, prepare)
+    assert (result.outcome, "end the second vision service" in result.reason) == (Outcome.FAILED, True), result.reason
+
+
+def test_one_vision_service_that_starts_again_is_not_two():
+    bench = virtual_bench()
+    assert is_there(bench)
+    robot = RobotPlayed(bench)
+    robot.film("left", 3)
+    bench._peers[0].sender.session = "0badf00d"
+    robot.film("left", 3)
+    assert len({one.fields["session"] for one in robot.answers()}) == 2
 
 
 class NotFinite(BrokenVision):
