@@ -217,7 +217,7 @@ class RawWebSocket(RawConnection):
 
 
 class RawStopPort:
-    """Sends datagrams to the STOP port beside an endpoint. A context manager."""
+    """Sends datagrams to the STOP port next to an endpoint. A context manager."""
 
     def __init__(self, endpoint: str) -> None:
         """Open a socket for each family of its host, which may listen on one. Raises LinkError without an address."""

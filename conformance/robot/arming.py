@@ -156,7 +156,7 @@ def human_beside(bench: Bench, human: Sender) -> None:
     human.need_good()
     human.drive()
     bench.need(bench.wait(lambda: human.seq >= 9, 3_000_000), "too few frames")
-    Sender(human.robot, "operator").expect_rejected("arm", "NOT_ALLOWED", "a request beside the human")
+    Sender(human.robot, "operator").expect_rejected("arm", "NOT_ALLOWED", "a request while a human drives")
 
 
 @SUITE.must("R-ARM-10", "8.2 Requests and replies", armed)
@@ -322,12 +322,12 @@ def reset_beside_a_human(bench: Bench, human: Sender) -> None:
     """While a human holds the lease, no other source may reset: NOT_ALLOWED."""
     operator = _stopped(bench)
     bench.need(human.robot.status().holder is not None, "the lease of the human has ended")
-    operator.expect_rejected("reset", "NOT_ALLOWED", "a request beside the human")
+    operator.expect_rejected("reset", "NOT_ALLOWED", "a request while a human drives")
 
 
 @SUITE.must("R-STOP-02", "13.5 Security", teleop)
 def any_role_stops(bench: Bench, human: Sender) -> None:
-    """STOP is granted to a role that may not drive, beside a human who drives."""
+    """STOP is granted to a role that may not drive, while a human drives."""
     human.need_good()
     human.drive()
     Sender(human.robot, bench.access.watcher).send_request("stop")

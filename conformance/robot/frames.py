@@ -107,14 +107,14 @@ def exact_keys(bench: Bench) -> None:
 
 @SUITE.must("R-FRAM-08", "10.1 Camera, odometry, scan", watched)
 def camera_model_is_of_the_picture(bench: Bench, robot: Robot) -> None:
-    """The camera model's width and height are those of the encoded picture."""
+    """The camera model's width and height are those of the encoded image."""
     model, frames = robot.camera(), [one for one in bench.received(FRAME) if _is_jpeg(one)]
-    bench.need(model is not None and frames, "no camera model or no picture to compare")
+    bench.need(model is not None and frames, "no camera model or no image to compare")
     assert model is not None
     size = read_jpeg_size(frames[-1].message.payload)
     bench.expect(
         (size.width_px, size.height_px) == (model.width_px, model.height_px),
-        f"the picture is {size.width_px}x{size.height_px}, the model {model.width_px}x{model.height_px}",
+        f"the image is {size.width_px}x{size.height_px}, the model {model.width_px}x{model.height_px}",
     )
 
 
@@ -199,7 +199,7 @@ def _status_counts(robot: Robot) -> None:
 
 
 SUITE.must_all(watched, {
-    "R-FRAM-01": ("2.8 Fields", "Every frame has a header with all that FrameHeader demands, in its bounds.",
+    "R-FRAM-01": ("2.8 Fields", "Every frame has a header with all required fields of FrameHeader, in their bounds.",
                   lambda it: _all_frames(it, lambda one: one.header(FrameHeader), "no FrameHeader")),
     "R-FRAM-02": ("3.1 Payload", "The payload of every frame is a baseline or progressive JPEG of at most 1920 x "
                   "1080 pixels and nothing else.", lambda it: _all_frames(it, _is_jpeg, "no JPEG within bounds")),
@@ -456,7 +456,7 @@ def _second_hastens_nothing(first: Sender) -> None:
     Sender(first.robot, bench.access.watcher)
     beside = fps_of(bench)
     bench.need(alone <= 1.5e6 / SLOW_US, f"{alone:.0f} fps to a slow peer alone (R-FLOW-02)")
-    bench.expect(beside <= 1.5 * alone, f"{alone:.0f} fps to a slow peer, {beside:.0f} beside a quick one")
+    bench.expect(beside <= 1.5 * alone, f"{alone:.0f} fps to a slow peer, {beside:.0f} next to a quick one")
 
 
 def _returns_nothing(watcher: Sender, what: str, forge: Callable[[Sender, FrameHeader], None]) -> None:

@@ -48,7 +48,7 @@ def _guest(bench: Bench) -> Sender:
 @SUITE.must("R-DIAL-01", "4.6 Guests")
 def guests(bench: Bench) -> None:
     """A twist of `guest` without header is validated, or rejected as UNKNOWN_SOURCE where guests are switched off."""
-    bench.need(not bench.access.is_guarded, "where keys are demanded no guest gets in")
+    bench.need(not bench.access.is_guarded, "where keys are required no guest is accepted")
     watcher = Sender(Robot(bench), bench.access.watcher)
     result = watcher.result_of(lambda: _bare(bench))
     bench.expect(result in (GOOD, "UNKNOWN_SOURCE"), f"it was {result}")
@@ -279,7 +279,7 @@ def many_peers(bench: Bench, robot: Robot) -> None:
     """A hundred sessions that send twists leave the lease where it was."""
     driver, second = Sender(robot), Sender(robot)
     driver.need_good()
-    bench.need(second.twist_result() == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
+    bench.need(second.twist_result() == "NOT_HOLDER", "a second driver is not rejected (R-LEASE-02)")
     driver.drive()
     for number in range(100):
         frame = robot.frame()
@@ -342,7 +342,7 @@ def stays_still(bench: Bench, driver: Sender) -> None:
 def lease_is_not_the_connection(bench: Bench, sender: Sender) -> None:
     """The lease is not the connection: within its second it holds though the driver was cut off."""
     second = Sender(sender.robot)
-    bench.need(second.twist_result() == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
+    bench.need(second.twist_result() == "NOT_HOLDER", "a second driver is not rejected (R-LEASE-02)")
     sender.twist(sender.robot.frame())
     sender.robot.next_status()
     _away(bench, 100_000)

@@ -51,7 +51,7 @@ def _held_alone(bench: Bench) -> tuple[Sender, Sender]:
     """Return the holder of the lease, and a second driver that is rejected."""
     first = ready(bench)
     second = Sender(first.robot)
-    bench.need(second.twist_result() == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
+    bench.need(second.twist_result() == "NOT_HOLDER", "a second driver is not rejected (R-LEASE-02)")
     first.need_good()
     return first, second
 
@@ -205,7 +205,7 @@ def second_human_waits(_bench: Bench, human: Sender) -> None:
 @SUITE.must("R-LEASE-30", "6.1 Lease")
 def guest_waits(bench: Bench) -> None:
     """`guest` does not take the lease from `vision`, without a header or with one."""
-    bench.need(not bench.access.is_guarded, "where keys are demanded no guest gets in")
+    bench.need(not bench.access.is_guarded, "where keys are required no guest is accepted")
     first = ready(bench)
     guest = Sender(first.robot, "guest", acks=False)
     bare = guest.result_of(lambda: bench.publish(TWIST, b"", CRAWL, "guest"))
@@ -436,7 +436,7 @@ def token_ends_the_lease(bench: Bench, held: tuple[Sender, Callable[[], None]]) 
     """The lease ends with the token of the holder."""
     first, withdraw = held
     second = Sender(first.robot)
-    bench.need(second.twist_result() == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
+    bench.need(second.twist_result() == "NOT_HOLDER", "a second driver is not rejected (R-LEASE-02)")
     withdraw()
     bench.rest(_TOKEN_US)
     second.expect(GOOD, what="after the end of the token a second driver")

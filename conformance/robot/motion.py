@@ -253,7 +253,7 @@ def others_keep_nothing_alive(bench: Bench, driver: Sender) -> None:
     rejected = driver.robot.status().refused.get("NOT_HOLDER", 0)
     other.drive()
     kept_out = driver.robot.counts("NOT_HOLDER", rejected, 1_000_000)
-    bench.need(kept_out, "a second driver is not kept out (R-LEASE-02)")
+    bench.need(kept_out, "a second driver is not rejected (R-LEASE-02)")
     mark, _cited = _silent(driver)
     for number in range(20):  # until just before the lease of the first could end
         bench.after(number * 20_000, lambda: other.twist(driver.robot.frames()[-1][1]))

@@ -1,4 +1,4 @@
-"""Cases on the ports beside that of a link: the legacy text protocol, and STOP. Shell (sockets)."""
+"""Cases on the ports next to that of a link: the legacy text protocol, and STOP. Shell (sockets)."""
 
 import binascii
 import hmac
@@ -59,11 +59,11 @@ def _picture(text: bytes) -> bytes:
 
 @SUITE.must("R-DIAL-11", "15.1 On WebSocket: the legacy protocol", real=True)
 def pictures_as_text(bench: Bench) -> None:
-    """A client that connects without a sub-protocol gets pictures: text, base64, a JPEG."""
+    """A client that connects without a sub-protocol gets images: text, base64, a JPEG."""
     with _legacy(bench) as raw:
         bench.expect(raw.status == _SWITCHED, f"HTTP {raw.status}")
         pictures = list(raw.messages(1.5))
-        bench.expect(pictures, "no picture within 1.5 s")
+        bench.expect(pictures, "no image within 1.5 s")
         good = [opcode == TEXT and _picture(text) for opcode, text in pictures]
         bench.expect(all(good), f"{len(good) - sum(map(bool, good))} of {len(good)} messages are not images as text")
 
@@ -73,7 +73,7 @@ def newlines(bench: Bench) -> None:
     """The base64 has a newline after every 76 characters and at the end (robots with `?oneline` have none)."""
     with _legacy(bench) as raw:
         texts = [text for opcode, text in raw.messages(1.5) if opcode == TEXT and _picture(text)]
-        bench.need(texts, "no picture as text (R-DIAL-11)")
+        bench.need(texts, "no image as text (R-DIAL-11)")
         for text in texts:
             *lines, last = text.split(b"\n")
             bench.expect(lines and last == b"", "there is no newline at the end")
@@ -137,14 +137,14 @@ def twists_return_credit(bench: Bench) -> None:
         for _ in raw.messages(_COMPARED_S):
             answered += 1
             raw.send(TEXT, b"0|0")
-        bench.need(silent, "no picture (R-DIAL-11)")
-        counts = f"{answered} pictures in {_COMPARED_S} s to a client that answers each, {silent} to a silent one"
+        bench.need(silent, "no image (R-DIAL-11)")
+        counts = f"{answered} images in {_COMPARED_S} s to a client that answers each, {silent} to a silent one"
         bench.expect(answered >= 1.5 * silent, counts)
 
 
 @SUITE.must("R-DIAL-19", "15.2 On WebSocket: the legacy protocol", real=True)
 def origins(bench: Bench) -> None:
-    """An Origin that is the Host, as older libraries send it, is let in; another site's fails with 403."""
+    """An Origin that is the Host, as older libraries send it, is accepted; another site's fails with 403."""
     bench.need(bench.legacy, "no port of the legacy protocol was named (--older)")
     _tls, address, port = split_url(bench.legacy)
     for origin, status in ((f"http://{address}:{port}", _SWITCHED), ("http://evil.example.com", 403)):
@@ -154,10 +154,10 @@ def origins(bench: Bench) -> None:
 
 @SUITE.must("R-DIAL-20", "15.3 On WebSocket: the legacy protocol", real=True)
 def several_clients(bench: Bench) -> None:
-    """Several clients each get pictures."""
+    """Several clients each get images."""
     with _legacy(bench) as first, _legacy(bench) as second:
         first_came, second_came = list(first.messages(1.2)), list(second.messages(0.8))
-        bench.need(first_came or second_came, "no pictures (R-DIAL-11)")
+        bench.need(first_came or second_came, "no images (R-DIAL-11)")
         bench.expect(first_came and second_came, f"{len(first_came)} to the first, {len(second_came)} to the second")
 
 

@@ -375,7 +375,7 @@ def remembers_frames(bench: Bench, sender: Sender) -> None:
 def rejected_for_the_lease_counts(bench: Bench, first: Sender) -> None:
     """A `seq` is used up though the lease rejects its twist: one below it is OUT_OF_ORDER then."""
     second = Sender(first.robot)
-    bench.need(second.twist_result(seq=5000) == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
+    bench.need(second.twist_result(seq=5000) == "NOT_HOLDER", "a second driver is not rejected (R-LEASE-02)")
     second.expect("OUT_OF_ORDER", seq=100)
 
 

@@ -172,7 +172,7 @@ def foreign_origin(bench: Bench) -> None:
 
 @SUITE.must("R-SOCK-06", "14.2 Host and Origin", real=True)
 def own_origin(bench: Bench) -> None:
-    """An Origin that is the Host itself is let in."""
+    """An Origin that is the Host itself is accepted."""
     tls, address, port = split_url(endpoint_of(bench))
     origin = f"http{'s' if tls else ''}://{address}:{port}"
     _answers(bench, SWITCHED, "Origin as the Host", headers=(("Origin", origin),))
@@ -560,7 +560,7 @@ def replies_go_to_all(bench: Bench) -> None:
 @SUITE.must("R-SOCK-45", "14.6 Messages", real=True)
 def block_without_header(bench: Bench) -> None:
     """A block of channel and source alone is a message without header: a guest's twist, or UNKNOWN_SOURCE."""
-    bench.need(not bench.access.is_guarded, "where keys are demanded no guest gets in")
+    bench.need(not bench.access.is_guarded, "where keys are required no guest is accepted")
     with spoken(bench, role="guest") as raw:
         result = _reason_given(
             bench, lambda: raw.send(BINARY, block(b'{"channel":"twist","source":"guest"}', b"0.1|0"))
@@ -638,7 +638,7 @@ def token_as_bearer(bench: Bench) -> None:
 
 @SUITE.must("R-SOCK-39", _CLAUSE, real=True)
 def token_is_not_repeated(bench: Bench) -> None:
-    """Beside a token `sightline.v1` is selected, wherever it stands, and the token is never repeated."""
+    """Next to a token `sightline.v1` is selected, wherever it stands, and the token is never repeated."""
     token = _token(bench)
     for protocols in ((entry_of(token), SUBPROTOCOL), (SUBPROTOCOL, entry_of(token))):
         with RawWebSocket(endpoint_of(bench), protocols) as raw:

@@ -79,7 +79,7 @@ def empty_ack(bench: Bench) -> None:
     _sample(bench, junk=0)
     bench.need(bench.dropped_here[OVERSIZE] == before, "its twists are too large already")
     _sample(bench, junk=3)
-    bench.expect(bench.dropped_here[OVERSIZE] == before, "an answer to what is not picture was over its channel's size")
+    bench.expect(bench.dropped_here[OVERSIZE] == before, "an answer to an invalid image was over its channel's size")
 
 
 @SUITE.must("V-FRAM-04", "1.3 Keys")
@@ -429,7 +429,7 @@ _NOT_FOLLOWING: Final = "it does not follow the yellow ball"
 
 @SUITE.must("V-STEER-11", "4.4 Signs", met)
 def turns_by_the_new_size(bench: Bench, robot: RobotPlayed) -> None:
-    """After a change of the picture size, a target right of the new middle is turned to."""
+    """After a change of the image size, a target right of the new middle is turned to."""
     bench.need(_last_twist(bench, robot, "right").speeds[1] < 0, _NOT_FOLLOWING)
     robot.show(HALF_CAMERA)
     angular = _last_twist(bench, robot, "right_half").speeds[1]
@@ -438,7 +438,7 @@ def turns_by_the_new_size(bench: Bench, robot: RobotPlayed) -> None:
 
 @SUITE.should("V-STEER-12", "10.1 Camera, odometry, scan", met)
 def turns_by_the_new_model(bench: Bench, robot: RobotPlayed) -> None:
-    """A camera model of the same picture size, with its middle elsewhere, is steered by within a second."""
+    """A camera model of the same image size, with its middle elsewhere, is steered by within a second."""
     bench.need(_last_twist(bench, robot, "left").speeds[1] > 0, _NOT_FOLLOWING)
     robot.show(LENS.model_copy(update={"cx_px": 40.0}))
     angular = _last_twist(bench, robot, "left").speeds[1]

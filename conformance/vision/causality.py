@@ -158,7 +158,7 @@ SUITE.must_all(met, {
 
 @SUITE.must("V-CAUS-12", "7.4 Window")
 def compute_time_is_true(bench: Bench) -> None:
-    """`compute_us` is at most the time from sending a frame to hearing its answer."""
+    """`compute_us` is at most the time from sending a frame to receiving its answer."""
     for sent, answer in _cited(bench):
         compute_us = answer.fields.get("compute_us", 0)
         took_us = answer.received.at_us - sent.at_us

@@ -75,7 +75,7 @@ def no_camera_model(bench: Bench) -> None:
 
 @SUITE.should("V-FLOW-07", "10.1 Camera, odometry, scan")
 def late_camera_model(bench: Bench) -> None:
-    """A camera model that comes two seconds late is taken in: twists follow within a second."""
+    """A camera model that comes two seconds late is used: twists follow within a second."""
     robot = RobotPlayed(bench, camera=None)
     robot.film("left", 40, 50_000)
     robot.show(LENS)
@@ -86,7 +86,7 @@ def late_camera_model(bench: Bench) -> None:
 
 @SUITE.should("V-FLOW-08", "10.1 Camera, odometry, scan", met)
 def other_camera_model(bench: Bench, robot: RobotPlayed) -> None:
-    """A camera that changes its picture size is followed: twists within a second."""
+    """A camera that changes its image size is followed: twists within a second."""
     robot.show(HALF_CAMERA)
     bench.rest(50_000)
     sent = robot.film("left_half", 20, 50_000)
@@ -124,14 +124,14 @@ def back_after_silence(bench: Bench, robot: RobotPlayed) -> None:
 
 @SUITE.must("V-SIL-03", "3.3 A rejected image", met)
 def silent_about_no_pictures(bench: Bench, robot: RobotPlayed) -> None:
-    """When pictures cease to be pictures, twists cease."""
+    """When images are invalid, twists cease."""
     robot.film("left", 5)
     bench.rest(_CATCH_UP_US)
     mark = bench.mark()
     for _ in range(10):
         robot.frame(jpeg=b"\xff\xd8\xff\xd9")
         bench.rest(FRAME_US)
-    bench.expect(not robot.twists(mark), f"{len(robot.twists(mark))} twists answered what is not picture")
+    bench.expect(not robot.twists(mark), f"{len(robot.twists(mark))} twists answered invalid images")
 
 
 # --- reports of the robot ---------------------------------------------------------------------------------------------

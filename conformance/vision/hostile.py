@@ -167,7 +167,7 @@ def _not_believed(payload: bytes, header: Fields, title: str, robot: RobotPlayed
 
 
 SUITE.must_all(met, {
-    number: (clause, f"{title} is not believed.", partial(_not_believed, payload, header, title))
+    number: (clause, f"{title} is not used.", partial(_not_believed, payload, header, title))
     for number, (title, clause, payload, header) in CAMERAS.items()
 })
 
@@ -244,7 +244,7 @@ REJECTED: Final[dict[str, tuple[str, Callable[[], bytes]]]] = {
                  lambda: filled(picture("left"), 63)),
     "V-LIM-23": ("A JPEG with its tables and 63 markers without a length before its frame header",
                  lambda: picture("left")[:2] + b"\xff\x01" * 63 + picture("left")[2:]),
-    "V-LIM-19": ("A picture of another size than the camera's", lambda: picture("left_half")),
+    "V-LIM-19": ("An image of another size than the camera's", lambda: picture("left_half")),
     "V-LIM-18": ("A JPEG of zeros after its start", lambda: b"\xff\xd8" + bytes(4_000)),
 }
 """Images that must not drive: title, payload."""
@@ -271,7 +271,7 @@ for _level, _table in ((Level.MUST, REJECTED), (Level.SHOULD, DOUBTED)):
 
 @SUITE.must("V-LIM-31", "13.2 Bounds", met)
 def all_rejected_and_well(bench: Bench, robot: RobotPlayed) -> None:
-    """After every picture that must be rejected, plain frames are answered as before."""
+    """After every image that must be rejected, plain frames are answered as before."""
     for _, jpeg in (*REJECTED.values(), *DOUBTED.values()):
         robot.frame(jpeg=jpeg())
         bench.rest(20_000)

@@ -459,7 +459,7 @@ def _shown(client: AcceptedClient) -> list[str]:
 
 @SUITE.must("V-SOCK-14", "14.3 Token", real=True)
 def shows_its_token(bench: Bench) -> None:
-    """It shows its token, and shows it once: beside the sub-protocol, or as `Authorization: Bearer`."""
+    """It shows its token, and shows it once: next to the sub-protocol, or as `Authorization: Bearer`."""
     token = _token(bench)
     with server_of(bench) as server:
         shown = _shown(client_of(bench, server))
