@@ -7,6 +7,7 @@
  */
 
 import { randomBytes } from "node:crypto";
+import { createSocket } from "node:dgram";
 import { closeSync, existsSync, fsyncSync, mkdirSync, openSync, readFileSync, readdirSync, rmSync } from "node:fs";
 import { homedir } from "node:os";
 import { join } from "node:path";
@@ -19,6 +20,7 @@ import { TICK_US } from "./limits.mjs";
 import { servePage } from "./pages.mjs";
 import { Peer } from "./peer.mjs";
 import { Robot, WANTED_CHANNELS } from "./robot.mjs";
+import { StopPort } from "./stop_port.mjs";
 import { listen } from "./websocket.mjs";
 
 const USAGE = "node robot_server.mjs --port PORT --robot ID [--host 127.0.0.1] [--pictures FOLDER] [--fps 30] [--auto-arm] [--guests] [--state-dir DIR] [--token-file FILE] [--cert FILE --key FILE]";
@@ -146,10 +148,24 @@ class Server {
     });
     const s = tls ? "s" : "";
     this.log(`on ws${s}://${host}:${port}, session ${this.robot.session}, camera ${pictures ?? "drawn"}; viewer at http${s}://${host}:${port}/`);
+    this.openStopPort(host, Math.min(port + 1, 65_535));
     if (this.latch.isSet) this.log("STOPPED (STOP was set before the restart)");
     this.nextTick_us = this.nextCapture_us = now_us();
     this.tick();
     this.capture();
+  }
+
+  /** Accept STOP by UDP. Without the port STOP needs the link, so a failure does not end the robot. */
+  openStopPort(host, port) {
+    const stops = new StopPort(this.options.robot, this.robot.gate, randomBytes(16));
+    const socket = createSocket(host.includes(":") ? "udp6" : "udp4");
+    socket.on("error", (error) => this.log(`STOP port ${host}:${port}/udp: ${error.message}; STOP needs the link`));
+    socket.on("message", (data, sender) => {
+      if (!stops.onDatagram(data)) return;
+      this.showState(); // stores the latch before the answer
+      socket.send(stops.answer(data, this.latch.isSet), sender.port, sender.address, () => {}); // the sender repeats a lost one
+    });
+    socket.bind(port, host);
   }
 
   log(line) {
