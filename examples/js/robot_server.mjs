@@ -146,9 +146,9 @@ class Server {
     this.server = await listen({
       host, port, tls, token, onConnection: (connection) => this.onConnection(connection), onPage: servePage(host, robot),
     });
+    await this.openStopPort(host, Math.min(port + 1, 65_535));
     const s = tls ? "s" : "";
     this.log(`on ws${s}://${host}:${port}, session ${this.robot.session}, camera ${pictures ?? "drawn"}; viewer at http${s}://${host}:${port}/`);
-    this.openStopPort(host, Math.min(port + 1, 65_535));
     if (this.latch.isSet) this.log("STOPPED (STOP was set before the restart)");
     this.nextTick_us = this.nextCapture_us = now_us();
     this.tick();
@@ -159,6 +159,7 @@ class Server {
   openStopPort(host, port) {
     const stops = new StopPort(this.options.robot, this.robot.gate, randomBytes(16));
     const socket = createSocket(host.includes(":") ? "udp6" : "udp4");
+    const opened = new Promise((resolve) => socket.once("listening", resolve).once("error", resolve));
     socket.on("error", (error) => this.log(`STOP port ${host}:${port}/udp: ${error.message}; STOP needs the link`));
     socket.on("message", (data, sender) => {
       if (!stops.onDatagram(data)) return;
@@ -166,6 +167,7 @@ class Server {
       socket.send(stops.answer(data, this.latch.isSet), sender.port, sender.address, () => {}); // the sender repeats a lost one
     });
     socket.bind(port, host);
+    return opened;
   }
 
   log(line) {

@@ -15,6 +15,7 @@ import websocket
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from sightline.protocol.transports.stop_datagram import STOPPED, Kind, StopDatagram, pack_stop, unpack_stop
 from tests.fixtures.javascript import JsProcess, JsRobot, hello
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_port
@@ -41,6 +42,17 @@ def test_peer_without_a_hello_receives_the_reason(quiet_robot, first, code, reas
         with pytest.raises(ConnectionClosed) as closed:
             client.recv(5)
     assert closed.value.rcvd.code == code and reason in closed.value.rcvd.reason
+
+
+def test_stop_by_udp_latches_on_disk_before_its_answer(tmp_path):
+    with JsRobot(tmp_path) as robot, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.settimeout(5)
+        port = int(robot.endpoint.rpartition(":")[2]) + 1
+        sender.sendto(pack_stop(StopDatagram(Kind.STOP, "js1", 7)), ("127.0.0.1", port))
+        answer = unpack_stop(sender.recv(1000))
+        assert (answer.kind, answer.robot, answer.counter, answer.state) == (Kind.ANSWER, "js1", 7, STOPPED)
+        assert (answer.at_rest, answer.stored, answer.received, answer.applied) == (True, True, 1, 1)
+        assert [*tmp_path.rglob("js1.stopped")]
 
 
 def test_silent_client_is_dropped_after_two_seconds(quiet_robot):
