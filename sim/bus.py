@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import array
 import json
+import logging
 import math
 import os
 import select
@@ -23,6 +24,7 @@ import struct
 import time
 from collections import OrderedDict
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -44,6 +46,8 @@ PICTURE_REQUEST = struct.Struct("<BB")
 MAX_MESSAGE_BYTES = 1 << 20
 HELLO_TIMEOUT_S = 2.0
 _BATTERY_WAIT_S = 0.1
+_STARTS_WITHIN_S, _ANNOUNCED_AFTER_S, _RETRY_S = 5.0, 1.0, 0.05
+_log = logging.getLogger(__name__)
 
 
 def default_socket_dir() -> str:
@@ -155,6 +159,21 @@ class BusConnection:
 
     def _absent(self) -> HardwareError:
         return HardwareError(f"nothing simulates a robot in {self._dir}; start it with `sightline sim`")
+
+
+def await_simulation(socket_dir: str, seconds: float = _STARTS_WITHIN_S) -> None:
+    """Wait for a simulation that starts at the same time. Without one, the devices report its absence."""
+    begin_s, is_announced = time.monotonic(), False
+    while (waited_s := time.monotonic() - begin_s) < seconds:
+        probe = BusConnection(socket_dir, MOTION)  # it sends nothing, so it does not own the motors
+        with suppress(HardwareError):
+            probe.open()
+            probe.close()
+            return
+        if waited_s >= _ANNOUNCED_AFTER_S and not is_announced:
+            is_announced = True
+            _log.info("waiting for `sightline sim` in %s ...", socket_dir)
+        time.sleep(_RETRY_S)
 
 
 class SimCamera:

@@ -43,7 +43,7 @@ from sightline.protocol.transports.open import check_link, open_link
 from sightline.protocol.transports.security import ROBOT_ROLE
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.hardware.cameras.lens import LensConfig
-from sightline.robot_side.plugins import DEVICE_GROUPS
+from sightline.robot_side.plugins import DEVICE_GROUPS, DRIVES
 from sightline.sim.process import SimConfig
 from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario
@@ -156,6 +156,10 @@ def robot(
     given: Any = loaded.config
     if zero_motors:
         return set_to_zero(given)
+    if given.motors.kind == "sim":
+        from sightline.sim.bus import await_simulation
+
+        await_simulation(DRIVES.load(given.motors)[1].socket_dir)
     with needs("zenoh"):
         return run(given, become_guardian(given, restarts=True))
 

@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -24,7 +25,16 @@ demanded.module("pybullet", "sim")
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.robot_side.ports import Camera, Drive, RangeSensor
-from sightline.sim.bus import MOTION, MOTION_SET, SimCamera, SimDrive, SimRange, TruthReader, default_socket_dir
+from sightline.sim.bus import (
+    MOTION,
+    MOTION_SET,
+    SimCamera,
+    SimDrive,
+    SimRange,
+    TruthReader,
+    await_simulation,
+    default_socket_dir,
+)
 from sightline.sim.process import SimConfig, SocketFolder, run
 from sightline.sim.robot import load_robot
 
@@ -261,6 +271,28 @@ def test_missing_simulation_gives_one_line_with_the_command(tmp_path):
         with pytest.raises(HardwareError) as caught:
             port(port.Config(socket_dir=str(tmp_path)))
         assert str(caught.value) == f"nothing simulates a robot in {tmp_path}; start it with `sightline sim`"
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.2])
+def test_robot_waits_for_a_simulation_that_starts_with_it(tmp_path, caplog, monkeypatch, late_s):
+    caplog.set_level("INFO")
+    monkeypatch.setattr("sightline.sim.bus._ANNOUNCED_AFTER_S", 0.1)
+    began_s = time.monotonic()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.bind(str(tmp_path / MOTION))
+        starting = threading.Timer(late_s, listener.listen)
+        starting.start()
+        await_simulation(str(tmp_path))
+        starting.join()
+    assert late_s * 0.9 < time.monotonic() - began_s < 3
+    assert caplog.messages == [f"waiting for `sightline sim` in {tmp_path} ..."] * (late_s > 0.1)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.2])
+def test_wait_for_a_missing_simulation_ends(tmp_path, seconds):
+    began_s = time.monotonic()
+    await_simulation(str(tmp_path), seconds)
+    assert seconds <= time.monotonic() - began_s < seconds + 1
 
 
 def test_bad_settings_are_one_line(tmp_path):

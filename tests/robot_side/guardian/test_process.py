@@ -285,5 +285,6 @@ def test_a_robot_without_hardware_ends_with_one_line_and_its_exit_code(tmp_path)
     command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "robot", "--socket-dir", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     expected = f"nothing simulates a robot in {tmp_path}; start it with `sightline sim`\n"
-    assert done.returncode == 3 and not done.stdout
+    assert done.returncode == 3 and done.stdout.endswith(f" info waiting for `sightline sim` in {tmp_path} ...\n")
+    assert done.stdout.count("\n") == 1
     assert done.stderr.endswith(expected) and done.stderr.count("\n") == 1
