@@ -43,6 +43,7 @@ from sightline.protocol.transports.open import check_link, open_link
 from sightline.protocol.transports.security import ROBOT_ROLE
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.hardware.cameras.lens import LensConfig
+from sightline.robot_side.hardware.gpio import GpioDriveConfig
 from sightline.robot_side.plugins import DEVICE_GROUPS, DRIVES
 from sightline.sim.process import SimConfig
 from sightline.sim.robot import load_robot
@@ -409,6 +410,8 @@ def _check_names(config: BaseModel) -> None:
             options = group.load(choice)[1] if choice else None
             if isinstance(options, LensConfig):
                 options.given_model()
+            if isinstance(options, GpioDriveConfig):
+                options.rows()
         zero_of(config)
     if isinstance(config, SimConfig):
         load_robot(config.robot or load_scenario(config.scenario).robot)

@@ -75,14 +75,13 @@ def open_link(
 def check_link(listen: Sequence[str], connect: Sequence[str], role: str, secure: str) -> None:
     """Raise ConfigError for endpoints, keys or tokens with which `open_link` fails. Opens nothing."""
     from sightline.protocol.transports.endpoints import check_zenoh_endpoints, parse_websocket_endpoint
-    from sightline.protocol.transports.security import check_listening, load_role_keys, read_tokens
+    from sightline.protocol.transports.security import check_keys, check_listening, load_role_keys, read_tokens
     from sightline.protocol.transports.websocket.tls import client_tls_context, server_tls_context
 
     web, zenoh = ([_of_kind(ends, is_web) for ends in (listen, connect)] for is_web in (True, False))
     if any(zenoh) or not any(web):
         check_zenoh_endpoints(*zenoh)
-        if keys := load_role_keys(secure, role):
-            keys.check([*zenoh[0], *zenoh[1]])
+        check_keys(load_role_keys(secure, role), [*zenoh[0], *zenoh[1]])
     for endpoint in map(parse_websocket_endpoint, web[0]):
         check_listening(endpoint, {} if endpoint.legacy else read_tokens(secure))
         if endpoint.secure:

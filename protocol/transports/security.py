@@ -86,6 +86,16 @@ class RoleKeys:
         }
 
 
+def check_keys(keys: RoleKeys | None, endpoints: Sequence[str]) -> None:
+    """Raise ConfigError for an endpoint that does not fit the keys of its link, or their absence."""
+    if keys is not None:
+        keys.check(endpoints)
+        return
+    for endpoint in endpoints:
+        if (kind := parse_zenoh_endpoint(endpoint)[0]) in _TLS:
+            raise ConfigError(f"{endpoint}: a {kind}/ endpoint needs keys; pass --secure DIR")
+
+
 def size_limit_section() -> list[dict[str, Any]]:
     """Return Zenoh's `low_pass_filter`, so that the listening end drops a message above the limit of its channel."""
     return [

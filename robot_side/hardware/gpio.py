@@ -304,6 +304,17 @@ class GpioDriveConfig(TableConfig):
         """Pins of the motors: left forward and backward, right forward and backward."""
         return self.left_forward_pin, self.left_backward_pin, self.right_forward_pin, self.right_backward_pin
 
+    def rows(self) -> tuple[tuple[float, float], ...]:
+        """Return the rows of `table_file` or `table`. Raises ConfigError if the file cannot be read."""
+        path = self.table_file
+        if path is None:
+            return self.table
+        try:
+            return table_of(home_path(path).read_text("utf-8-sig"), str(path))
+        except (OSError, UnicodeDecodeError) as error:
+            cause = error.strerror if isinstance(error, OSError) else "not text"
+            raise ConfigError(f"{path}: cannot be read: {cause}; write one with `sightline calibrate drive`") from None
+
     @model_validator(mode="after")
     def _are_distinct(self) -> Self:
         numbers = [*self.pins, *self.enable_pins, *([] if self.pulse_pin is None else [self.pulse_pin])]
@@ -328,7 +339,7 @@ class GpioDrive:
         pause: Callable[[float], None] = time.sleep,
     ) -> None:
         self._config = config
-        self.table = DutyTable(_rows(config))
+        self.table = DutyTable(config.rows())
         self._pins: Pins | None = opening(config)
         left, right = _Motor(config.pins[:2], config.left_reversed), _Motor(config.pins[2:], config.right_reversed)
         self._motors = (right, left) if config.swapped else (left, right)
@@ -448,14 +459,3 @@ class _Motor:
         pins.write(number, duty)
         self._duty[number] = duty
         return True
-
-
-def _rows(config: GpioDriveConfig) -> tuple[tuple[float, float], ...]:
-    path = config.table_file
-    if path is None:
-        return config.table
-    try:
-        return table_of(home_path(path).read_text("utf-8-sig"), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        cause = error.strerror if isinstance(error, OSError) else "not text"
-        raise ConfigError(f"{path}: cannot be read: {cause}; write one with `sightline calibrate drive`") from None

@@ -31,7 +31,7 @@ from sightline.protocol.transports.endpoints import (
     uses_discovery,
     with_send_buffer,
 )
-from sightline.protocol.transports.security import RoleKeys, size_limit_section
+from sightline.protocol.transports.security import RoleKeys, check_keys, size_limit_section
 
 if TYPE_CHECKING:
     import zenoh
@@ -106,11 +106,7 @@ def open_session(
         ConfigError: Zenoh is missing, or an endpoint does not fit `secured`.
         LinkError: an endpoint cannot be opened, or no peer answers in time.
     """
-    if secured is not None:
-        secured.check((*listen, *connect))
-    elif keyless := next((one for one in (*listen, *connect) if one.startswith(("tls/", "quic/"))), ""):
-        kind = keyless.partition("/")[0]
-        raise ConfigError(f"{keyless}: a {kind}/ endpoint needs keys; pass --secure DIR")
+    check_keys(secured, (*listen, *connect))
     try:
         import zenoh
     except ImportError:

@@ -239,9 +239,13 @@ def test_command_whose_standard_streams_are_closed_has_the_null_device_and_so_ha
         *((["config", "check", "robot", "--set", value], 2, why) for value, why in (
             ("listen=[]", "no endpoint; pass one to listen on"),
             ("listen=tcp/127.0.0.1:1,tcp/127.0.0.1:1", "tcp/127.0.0.1:1 is listed twice"),
+            ("listen=tls/127.0.0.1:1", "tls/127.0.0.1:1: a tls/ endpoint needs keys"),
+            ("connect=quic/127.0.0.1:1", "quic/127.0.0.1:1: a quic/ endpoint needs keys"),
             ("listen=tcp/0.0.0.0:7448", "its STOP port would be 7449/udp"),
             ("state_dir=~no-user/x", "no home folder for '~no-user' in ~no-user/x"),
         )),
+        (["config", "check", "robot", "--set", "drive.kind=gpio", "--set", "drive.options.table_file=no.toml"], 2,
+         "no.toml: cannot be read: No such file or directory; write one with `sightline calibrate drive`"),
         (["config", "check", "robot", "no such file.toml"], 2,
          "no such file.toml: No such file or directory; name a TOML file that you may read"),
         (["config", "check", "vision", "--set", "targt.radius_m=1"], 2, "did you mean 'target.radius_m'"),
