@@ -350,8 +350,10 @@ class Service:
             self._mission_channel.report(self._now_us() / 1e6, self._acknowledge(NO_FRAMES), None)
         if now_s - self._received_s > _SILENCE_S:
             self._robot_session = ""
-            self._log_change("link", f"no frames from robot {self._config.robot} at {endpoints_text(self._config)}; is "
-                               "`sightline robot` running there, with this robot id?")
+            fix = "does its program send images?" if self._is_legacy else (
+                "is `sightline robot` running there, with this robot id?")
+            self._log_change(
+                "link", f"no frames from robot {self._config.robot} at {endpoints_text(self._config)}; {fix}")
 
     def counts(self) -> ServiceCounts:
         """Return the counters. Safe from any thread."""

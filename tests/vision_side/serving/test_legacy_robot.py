@@ -192,6 +192,18 @@ def test_the_printed_option_sets_the_assumed_camera():
     assert load_service("vision", file=None, sets=[option], options={}, environ={}).config.camera == camera
 
 
+@pytest.mark.parametrize(("endpoint", "fix"), [
+    ("ws-legacy://127.0.0.1:9091", "does its program send images?"),
+    ("tcp/127.0.0.1:7447", "is `sightline robot` running there, with this robot id?"),
+])
+def test_silence_of_a_robot_is_reported_with_the_fix_for_its_kind(bench, monkeypatch, endpoint, fix):
+    said = []
+    service = Service(VisionConfig(connect=(endpoint,)), bench.link, said.append)
+    monkeypatch.setattr("sightline.vision_side.serving.service._SILENCE_S", -1.0)
+    service.turn(0.0)
+    assert said[-1] == f"vision: no frames from robot r1 at {endpoint}; {fix}"
+
+
 def test_a_service_assumes_a_camera_for_a_legacy_robot_once_and_drives(bench):
     said = []
     service = Service(VisionConfig(connect=("ws-legacy://127.0.0.1:9091",)), bench.link, said.append)
