@@ -2,6 +2,7 @@
 
 import json
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
@@ -40,7 +41,9 @@ def codec(*, as_json: Json = False) -> int:
     """Measure encoding and decoding of frame header and twist"""
     from sightline.benchmarks.costs import measure_codec
 
-    return _print_checks(measure_codec(), as_json)
+    with _load_shown():
+        checks = measure_codec()
+    return _print_checks(checks, as_json)
 
 
 def gate(*, as_json: Json = False) -> int:
@@ -48,10 +51,12 @@ def gate(*, as_json: Json = False) -> int:
     from sightline.benchmarks.costs import GATE_BOUND_US, PROOF_BOUND_US, measure_gate, measure_proof
     from sightline.evaluation.checks import at_most
 
-    return _print_checks([
-        at_most("offer and step", measure_gate(), "us", GATE_BOUND_US),
-        at_most("proof, most hashes", measure_proof(), "us", PROOF_BOUND_US),
-    ], as_json)
+    with _load_shown():
+        checks = [
+            at_most("offer and step", measure_gate(), "us", GATE_BOUND_US),
+            at_most("proof, most hashes", measure_proof(), "us", PROOF_BOUND_US),
+        ]
+    return _print_checks(checks, as_json)
 
 
 def pipeline(*, as_json: Json = False) -> int:
@@ -64,7 +69,9 @@ def pipeline(*, as_json: Json = False) -> int:
     from sightline.evaluation.checks import Check, at_most
 
     checks = []
-    for one in time_steps():
+    with _load_shown():
+        steps, learned = time_steps(), time_learned()
+    for one in steps:
         size = f"{one.width_px}x{one.height_px}"
         checks.append(Check(
             f"step at {size}, hot (best round {one.alone_us:.0f}, paced {one.paced_us:.0f}, "
@@ -73,7 +80,6 @@ def pipeline(*, as_json: Json = False) -> int:
         ))
         checks.append(at_most(f"hsv at {size}, decoding included, hot (best round {one.hsv_alone_us:.0f})",
                               one.hsv_us, "us", one.bound_us))
-    learned = time_learned()
     checks.append(at_most(
         f"onnx at 320x240, network only, hot (best round {learned.alone_us:.0f}, "
         f"from JPEG to boxes {learned.whole_us:.0f}, decode {learned.decode_us:.0f}; {learned.engine})",
@@ -116,6 +122,19 @@ def demo(
          f"bound {number(one.bound)}", "ok" if one.ok else "FAIL") for one in figures
     )
     return print_result({"ok": all(figure.ok for figure in figures), "checks": checks}, lines, as_json)
+
+
+@contextmanager
+def _load_shown() -> Iterator[None]:
+    """Print the share of this machine that other programs used meanwhile, if it is too large for a measurement."""
+    from sightline.benchmarks.loop.counters import read_machine, taken_percent
+    from sightline.benchmarks.loop.figures import TAKEN_BOUND_PERCENT
+
+    before, began_s = read_machine({}), time.monotonic()
+    yield
+    others = taken_percent(before, read_machine({}), time.monotonic() - began_s)
+    if others > TAKEN_BOUND_PERCENT:
+        typer.echo(f"bench: others used {others:.0f} % of this machine; close other programs and repeat", err=True)
 
 
 def _print_checks(checks: "Sequence[Check]", as_json: bool) -> int:
