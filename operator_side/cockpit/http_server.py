@@ -10,8 +10,9 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
+from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from importlib.resources import files
 from pathlib import Path
@@ -157,6 +158,12 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         self._answer("POST")
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Answer a request that is not HTTP, or has another method, with one line as all other errors."""
+        self.close_connection, self.request_version = True, self.protocol_version  # unknown after an invalid one
+        answer = as_json({"error": message or explain or HTTPStatus(code).phrase}, code)
+        self._send(replace(answer, headers={"Connection": "close"}))
 
     def log_message(self, format: str, *arguments: Any) -> None:
         """Log no requests."""

@@ -158,3 +158,19 @@ def test_a_route_that_raises_is_logged_once_with_its_traceback_and_counted(port,
             pass
     assert until(lambda: faults() == {"web page": 2})
     assert caplog.messages == ["web page raised ZeroDivisionError: division by zero"] and caplog.records[0].exc_info
+
+
+@pytest.mark.parametrize(("request_line", "status", "words"), [
+    ("PUT /echo HTTP/1.1", 501, "Unsupported method ('PUT')"),
+    ("DELETE / HTTP/1.1", 501, "Unsupported method ('DELETE')"),
+    ("GET / HTTP/9.9", 505, "Invalid HTTP version (9.9)"),
+    ("GET / HTTP/x", 400, "Bad request version ('HTTP/x')"),
+    (f"GET /{'a' * 70_000} HTTP/1.1", 414, "URI Too Long"),
+])
+def test_request_that_is_not_served_is_one_line_of_json(port, request_line, status, words):
+    with socket.create_connection(("127.0.0.1", port), 5) as one, one.makefile("rb") as answer:
+        one.sendall(f"{request_line}\r\nHost: 127.0.0.1\r\n\r\n".encode())
+        head, _, body = answer.read().partition(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 %d " % status) and b"Content-Type: application/json" in head
+    assert b"Connection: close" in head and b"Content-Length: %d" % len(body) in head
+    assert list(json.loads(body)) == ["error"] and words.lower() in json.loads(body)["error"].lower()
