@@ -229,7 +229,8 @@ def _reading(path: Path) -> Iterator[Any]:
     except OSError as error:
         raise ConfigError(f"cannot read recording {path}: {error.strerror}") from None
     except (McapError, ValueError, OverflowError, MemoryError) as error:  # a damaged length may have any value
-        raise ConfigError(f"invalid recording {path}: {type(error).__name__}") from None
+        why = f"damaged, or another type of file ({type(error).__name__})"
+        raise ConfigError(f"invalid recording {path}: {why}; choose a run.mcap") from None
 
 
 def _parse(topic: str, encoding: str, data: bytes) -> Message | None:

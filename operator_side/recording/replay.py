@@ -235,7 +235,7 @@ def _answer_header(message: Message) -> AnswerHeader | None:
 def _vision_config(path: Path) -> VisionConfig:
     text = read_about(path).get(VISION_CONFIG)
     if text is None:
-        raise ConfigError(f"{path} lacks the configuration of the vision service; record it again")
+        raise ConfigError(f"{path} lacks the configuration of the vision service; replay one of `sightline demo`")
     try:
         return VisionConfig.model_validate_json(text)
     except ValidationError:
