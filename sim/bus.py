@@ -36,7 +36,7 @@ from sightline.protocol.errors import HardwareError
 from sightline.protocol.messages import CameraModel
 from sightline.robot_side.ports import Picture, Ranges, WheelAngles
 from sightline.sim.truth import Truth
-from sightline.sim.zero import MOTION, MOTION_BUSY, MOTION_SET, zero
+from sightline.sim.zero import MOTION, MOTION_BUSY, MOTION_SET, check_free, zero
 
 RANGE, CAMERA, TRUTH = "range.sock", "camera.sock", "truth.sock"
 MOTION_ANGLES = struct.Struct("<ddq")
@@ -102,6 +102,7 @@ class BusConnection:
         except BlockingIOError:
             return False
         except OSError:
+            self.newest()  # raises, if the last message has the reason
             raise self._lost() from None
         return True
 
@@ -112,6 +113,8 @@ class BusConnection:
             size = connection.recv_into(self._buffer)
         except BlockingIOError:
             return None
+        except ConnectionResetError:  # the simulation ended with unread packets; those that it sent still follow
+            return self.receive()
         except OSError:
             raise self._lost() from None
         if not size:
@@ -228,6 +231,7 @@ class SimDrive:
     def __init__(self, config: SimSocketConfig) -> None:
         self._connection = BusConnection(config.socket_dir, MOTION)
         self._connection.open()
+        check_free(config.socket_dir)
         self._angles: WheelAngles | None = None
 
     def set(self, left_rad_s: float, right_rad_s: float) -> None:

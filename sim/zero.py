@@ -6,6 +6,7 @@ The guardian imports this module alone, so it needs no pydantic.
 import socket
 import struct
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, Final
 
 from sightline.protocol.errors import HardwareError
@@ -15,20 +16,40 @@ MOTION_SET: Final = struct.Struct("<dd")
 MOTION_BUSY: Final = b"busy"
 """Answer to a client that sets speeds while the connection of another one owns the motors."""
 _ANSWER_S: Final = 1.0
+_FREE_S: Final = 0.1
+_QUERY: Final = b"?"
+"""A packet that is not a command: it changes no speed, and its answer shows whether the motors have an owner."""
+_MOST_ANSWERS: Final = 200
+"""Bound of the encoder readings that come meanwhile, 100 per second."""
 
 
 def zero(config: Mapping[str, Any]) -> None:
     """Set the simulated motors to zero. `config`: the `Config` of the drive as plain values."""
     folder = config["socket_dir"]
+    try:
+        _offer(folder, MOTION_SET.pack(0.0, 0.0), _ANSWER_S)
+    except OSError as error:
+        why = error.strerror or "no answer"
+        raise HardwareError(f"the simulation in {folder} takes no motor commands ({why}); is it running?") from None
+
+
+def check_free(folder: str) -> None:
+    """Raise HardwareError if another process owns the simulated motors. A simulation that hangs counts as free."""
+    with suppress(OSError):
+        _offer(folder, _QUERY, _FREE_S)
+
+
+def _offer(folder: str, packet: bytes, answer_s: float) -> None:
+    """Send one packet on a connection of its own. Raises HardwareError for an owner, OSError without an answer."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
-        connection.settimeout(_ANSWER_S)
-        try:
-            connection.connect(f"{folder}/{MOTION}")
-            connection.send(MOTION_SET.pack(0.0, 0.0))
-            connection.shutdown(socket.SHUT_WR)
-            while answer := connection.recv(64):  # until the simulation has read all of it
-                if answer == MOTION_BUSY:
-                    raise HardwareError(f"another process owns the simulated motors in {folder}; end it")
-        except OSError as error:
-            why = error.strerror or "no answer"
-            raise HardwareError(f"the simulation in {folder} takes no motor commands ({why}); is it running?") from None
+        connection.settimeout(answer_s)
+        connection.connect(f"{folder}/{MOTION}")
+        connection.send(packet)
+        connection.shutdown(socket.SHUT_WR)
+        for _ in range(_MOST_ANSWERS):  # until the simulation has read all of it
+            answer = connection.recv(64)
+            if answer == MOTION_BUSY:
+                raise HardwareError(f"another process owns the simulated motors in {folder}; end it")
+            if not answer:
+                return
+    raise TimeoutError

@@ -191,6 +191,47 @@ def test_second_owner_of_the_motors_is_reported_and_moves_nothing(sim):
     assert [row[1:3] for row in sim.rows()] == [[1.0, 2.0]]
 
 
+def test_drive_of_owned_motors_does_not_open_and_moves_nothing(sim):
+    busy = f"^another process owns the simulated motors in {sim.socket_dir}; end it$"
+    owner = SimDrive(sim.config())
+    owner.set(1.0, 2.0)
+    eventually(sim.rows)
+    for _ in range(3):
+        with pytest.raises(HardwareError, match=busy):
+            SimDrive(sim.config())
+    owner.set(1.5, 2.5)
+    eventually(lambda: len(sim.rows()) == 2)
+    assert [row[1:3] for row in sim.rows()] == [[1.0, 2.0], [1.5, 2.5]]
+    owner.close()
+    SimDrive(sim.config()).close()
+
+
+@pytest.mark.parametrize("commands", [1, 2, 20])
+def test_busy_motors_are_the_reason_whatever_was_sent_meanwhile(sim, commands):
+    """The kernel reports packets that the simulation did not read as a reset, before its last message."""
+    owner, second = SimDrive(sim.config()), SimDrive(sim.config())
+    owner.set(1.0, 2.0)
+    eventually(sim.rows)
+    sim.process.send_signal(signal.SIGSTOP)
+    for _ in range(commands):
+        second.set(3.0, 4.0)
+    sim.process.send_signal(signal.SIGCONT)
+    connection = second._connection.open()
+    poll = select.poll()
+    poll.register(connection, select.POLLHUP)
+    eventually(lambda: any(event & select.POLLHUP for _, event in poll.poll(0)))
+    with pytest.raises(HardwareError, match="another process owns the simulated motors"):
+        second.set(3.0, 4.0)
+
+
+def test_drive_opens_in_time_when_the_simulation_hangs(sim):
+    sim.process.send_signal(signal.SIGSTOP)
+    begin_s = time.monotonic()
+    SimDrive(sim.config()).close()
+    assert time.monotonic() - begin_s < 0.2  # the guardian kills a driver process that is silent for longer
+    sim.process.send_signal(signal.SIGCONT)
+
+
 def test_wheels_that_roll_out_have_lines_unless_a_driver_owns_them(sim):
     drive = SimDrive(sim.config())
     drive.set(8.0, 8.0)
@@ -227,6 +268,7 @@ def test_malformed_motor_packets_change_nothing(sim):
         stranger.send(packet if isinstance(packet, bytes) else MOTION_SET.pack(*packet))
     eventually(lambda: len(sim.rows()) >= 2)
     assert [row[1:3] for row in sim.rows()] == [[3.0, 3.0], [4.0, 4.0]]
+    stranger.close()
     for bad in (nan, inf):
         with pytest.raises(ValueError, match="wheel speeds"):
             SimDrive(sim.config()).set(bad, 1.0)
