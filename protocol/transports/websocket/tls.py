@@ -24,18 +24,24 @@ def server_tls_context(folder: str, source: str) -> ssl.SSLContext:
         context.load_cert_chain(certificate, key)
     except FileNotFoundError:
         raise ConfigError(f"wss:// needs {role}.pem and {role}.key in a folder; pass --secure DIR") from None
-    except (OSError, ssl.SSLError) as error:
-        raise ConfigError(f"{certificate} and {key} are not a certificate and its key: {error}") from None
+    except PermissionError:
+        raise ConfigError(f"this account may not read {role}.pem and {role}.key in {folder}") from None
+    except OSError:  # also ssl.SSLError
+        named = f"{role}.pem or {role}.key is damaged, or they do not belong together in {folder}"
+        raise ConfigError(f"{named}; copy the files of {role} again from where they were made") from None
     return context
 
 
 def client_tls_context(folder: str) -> ssl.SSLContext:
     """Create the TLS context of a connecting end. It trusts `ca.pem`, or without a folder the system's authorities."""
-    authority = home_path(folder) / "ca.pem"
     try:
-        return ssl.create_default_context(cafile=str(authority) if folder else None)
-    except (OSError, ssl.SSLError) as error:
-        raise ConfigError(f"{authority} contains no certificate of an authority: {error}") from None
+        return ssl.create_default_context(cafile=str(home_path(folder) / "ca.pem") if folder else None)
+    except FileNotFoundError:
+        raise ConfigError(f"ca.pem is missing in {folder}; copy it from the folder of `sightline keys init`") from None
+    except PermissionError:
+        raise ConfigError(f"this account may not read ca.pem in {folder}") from None
+    except OSError:  # also ssl.SSLError
+        raise ConfigError(f"ca.pem is damaged in {folder}; copy it again from where it was made") from None
 
 
 def tls_handshake(near: socket.socket, context: ssl.SSLContext, host: str, deadline_s: float) -> ssl.SSLSocket:

@@ -4,6 +4,7 @@ import datetime
 import errno
 import json
 import shutil
+import ssl
 from contextlib import suppress
 
 import pytest
@@ -16,6 +17,7 @@ from sightline.protocol.transports.diagnosis import diagnose_tls, keys_problem
 from sightline.protocol.transports.open import open_link
 from sightline.protocol.transports.security import RoleKeys, date_problem, validity
 from sightline.protocol.transports.stop_port import stop_secret_file
+from sightline.protocol.transports.websocket.tls import client_tls_context, server_tls_context
 from sightline.protocol.transports.zenoh import link as zenoh_link
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.network import process as robot_process
@@ -64,6 +66,41 @@ def test_damaged_or_mixed_files_are_named_at_both_ends_of_a_link(tmp_path, damag
     endpoint = f"tls/127.0.0.1:{free_port()}"
     with pytest.raises(LinkError, match=f"^cannot listen on {endpoint}: {problem}"):
         open_link("r1", listen=[endpoint], role="robot", secure=str(tmp_path)).__enter__()
+
+
+PAIR = ("robot.pem or robot.key is damaged, or they do not belong together in {}; "
+        "copy the files of robot again from where they were made")
+CA = "ca.pem is damaged in {}; copy it again from where it was made"
+
+
+@pytest.mark.parametrize(("damage", "problem"), [
+    (lambda folder: (folder / "robot.key").write_text("x"), PAIR),
+    (lambda folder: (folder / "vision.key").rename(folder / "robot.key"), PAIR),
+    (lambda folder: (folder / "ca.pem").write_text(""), CA),
+    (lambda folder: (folder / "ca.pem").write_bytes(b"\xff" * 999), CA),
+    (lambda folder: ((folder / "ca.pem").unlink(), (folder / "ca.pem").mkdir()), CA),
+    (lambda folder: (folder / "ca.pem").unlink(),
+     "ca.pem is missing in {}; copy it from the folder of `sightline keys init`"),
+])
+def test_damaged_or_mixed_files_for_websocket_are_named_with_a_fix(tmp_path, damage, problem):
+    keys.make(tmp_path, [])
+    server_tls_context(str(tmp_path), "robot"), client_tls_context(str(tmp_path))
+    damage(tmp_path)
+    with pytest.raises(ConfigError) as error:
+        server_tls_context(str(tmp_path), "robot"), client_tls_context(str(tmp_path))
+    assert str(error.value) == problem.format(tmp_path)
+
+
+def test_files_for_websocket_that_may_not_be_read_are_named(tmp_path, monkeypatch):
+    def rejected(*_args, **_kw):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(ssl.SSLContext, "load_cert_chain", rejected)
+    monkeypatch.setattr(ssl, "create_default_context", rejected)
+    with pytest.raises(ConfigError, match=r"^this account may not read robot\.pem and robot\.key in keys$"):
+        server_tls_context("keys", "robot")
+    with pytest.raises(ConfigError, match=r"^this account may not read ca\.pem in keys$"):
+        client_tls_context("keys")
 
 
 @pytest.mark.parametrize("host", ["300.1.1.1", "192.168.1", "robot local", "robot/1"])
