@@ -298,9 +298,9 @@ def own_token(folder: str, source: str) -> str:
 
 def _read(file: Path) -> str:
     try:
-        token = file.read_text("ascii").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file} cannot be read: {error}") from None
+        token = file.read_text("ascii", "replace").strip()
+    except OSError as error:
+        raise ConfigError(f"cannot read {file}: {error.strerror}; make it readable for this account") from None
     if not _TOKEN.fullmatch(token):
         raise ConfigError(
             f"{file} contains no token: expected 16 to 128 letters, digits, '_' or '-'; try `openssl rand -hex 16`"

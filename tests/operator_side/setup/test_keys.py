@@ -15,7 +15,7 @@ from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports import open as opening
 from sightline.protocol.transports.diagnosis import diagnose_tls, keys_problem
 from sightline.protocol.transports.open import open_link
-from sightline.protocol.transports.security import RoleKeys, date_problem, validity
+from sightline.protocol.transports.security import RoleKeys, date_problem, own_token, read_tokens, validity
 from sightline.protocol.transports.stop_port import stop_secret_file
 from sightline.protocol.transports.websocket.tls import client_tls_context, server_tls_context
 from sightline.protocol.transports.zenoh import link as zenoh_link
@@ -89,6 +89,27 @@ def test_damaged_or_mixed_files_for_websocket_are_named_with_a_fix(tmp_path, dam
     with pytest.raises(ConfigError) as error:
         server_tls_context(str(tmp_path), "robot"), client_tls_context(str(tmp_path))
     assert str(error.value) == problem.format(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"short", b"\xff" * 32, b"a" * 129, b"two words of a token", b"\0" * 32])
+def test_file_without_a_token_is_reported_with_a_fix(tmp_path, content):
+    (tmp_path / "operator.token").write_bytes(content)
+    for read in (lambda: own_token(str(tmp_path), "operator"), lambda: read_tokens(str(tmp_path))):
+        with pytest.raises(ConfigError, match=f"^{tmp_path}/operator.token contains no token: expected "):
+            read()
+
+
+def test_token_that_may_not_be_read_is_reported_with_a_fix(tmp_path, monkeypatch):
+    file = tmp_path / "operator.token"
+    file.touch()
+
+    def rejected(*_args, **_kw):
+        raise PermissionError(13, "Permission denied", str(file))
+
+    monkeypatch.setattr(type(file), "read_text", rejected)
+    with pytest.raises(ConfigError) as error:
+        own_token(str(tmp_path), "operator")
+    assert str(error.value) == f"cannot read {file}: Permission denied; make it readable for this account"
 
 
 def test_files_for_websocket_that_may_not_be_read_are_named(tmp_path, monkeypatch):
