@@ -25,6 +25,16 @@ LEVELS = """(() => {
   return [canvas.width, canvas.height, found.size];
 })()"""
 
+WINDOWS = ((760, 1000), (320, 560), (844, 390), (1366, 650))
+"""Width and height of windows: the default of `Browser`, a phone upright and on its side, a laptop."""
+
+
+def place(page: Browser, part: str, width: int, height: int) -> list[float]:
+    """Return (top, bottom, left, right) of an element in a window of this size, by its id."""
+    page._call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=True)
+    box = f"document.getElementById({part!r}).getBoundingClientRect()"
+    return list(page.run(f"(({{ top, bottom, left, right }}) => [top, bottom, left, right])({box})"))
+
 
 class Started:
     """Run a `sightline` command until the end of the block: `with Started(folder, "sim", "--seed", "3") as sim`."""
@@ -146,3 +156,17 @@ def test_page_connects_with_the_token_after_the_hash(tmp_path: Path) -> None:
         with Browser(other, address) as page:
             assert until(lambda: page.text("link").startswith("no connection"), START_S), page.text("link")
             assert answered(page) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(640, 480), (480, 640), (16, 4000), (4000, 16)])
+def test_stop_button_is_visible_below_an_image_of_any_shape(tmp_path: Path, size: tuple[int, int]) -> None:
+    port = free_port()
+    with JsRobot(tmp_path, port=port) as robot, Browser(tmp_path, f"http://127.0.0.1:{port}/") as page:
+        assert until(lambda: answered(page) > 0, START_S), page.text("frames")
+        robot.kill()  # no later image changes the size
+        assert until(lambda: page.text("link").startswith("no connection"), 5.0), page.text("link")
+        page.run("Object.assign(document.getElementById('picture'), {{ width: {}, height: {} }}) && 0".format(*size))
+        for window in WINDOWS:
+            top, bottom, left, right = place(page, "stop", *window)
+            assert 0 < top < bottom <= window[1] and 0 <= left < right <= window[0], (window, bottom)

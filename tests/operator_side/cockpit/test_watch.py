@@ -8,6 +8,7 @@ import signal
 import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import av
@@ -17,12 +18,14 @@ from mcap.reader import make_reader
 
 from sightline.operator_side.cli.app import run
 from sightline.operator_side.client.pictures import Shot
+from sightline.operator_side.cockpit.http_server import HttpAnswer, Route, as_json, page, served
 from sightline.operator_side.recording.film import Film, film
 from sightline.operator_side.recording.recorder import read_recording
 from sightline.protocol.channels import FRAME
 from sightline.protocol.codec import decode
 from sightline.protocol.messages import FrameHeader
-from tests.e2e.javascript.test_browser import LEVELS, Started
+from tests.e2e.javascript.test_browser import LEVELS, WINDOWS, Started, place
+from tests.fixtures.cameras import jpeg
 from tests.fixtures.javascript import Browser, chromium
 from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_endpoint
@@ -239,6 +242,30 @@ def test_page_shows_the_overlay_and_frames_without_it(tmp_path: Path) -> None:
         # The page may notice the end before its newest image is 500 ms old.
         assert until(lambda: page.run("document.getElementById('figure').className") == "old", 1.0)
         assert page.errors == []
+
+
+def test_page_shows_a_whole_image_of_any_shape_in_any_window(tmp_path: Path) -> None:
+    chromium()
+    shown = {"jpeg": jpeg(640, 480)}
+    routes: dict[str, Route] = {
+        "GET /": lambda _request, _body: page("watch.html", robot="r1"),
+        "GET /watch.mjs": lambda _request, _body: page("watch.mjs"),
+        "GET /picture": lambda _request, _body: HttpAnswer(shown["jpeg"], "image/jpeg", headers={
+            "X-Number": "1", "X-Channel": "frame", "X-Age-Us": "0"}),
+        "GET /state": lambda _request, _body: as_json(
+            {"robot": "r1", "online": True, "state": "HOLD", "reason": "a reason", "lines": []}),
+    }
+    with served(routes, 0) as address, Browser(tmp_path, address) as browser:
+        for size in ("640x480", "480x640", "16x4000", "4000x16"):
+            shown["jpeg"] = jpeg(*map(int, size.split("x")))
+            assert until(partial(_shows, browser, f"frame {size}"), START_S)
+            for width, height in WINDOWS:
+                top, bottom, left, right = place(browser, "picture", width, height)
+                assert 0 <= top < bottom <= height and 0 <= left < right <= width, (size, width, height, bottom)
+
+
+def _shows(browser: Browser, image: str) -> bool:
+    return browser.text("age").startswith(image)
 
 
 def test_a_color_is_picked_on_the_page_and_written(tmp_path: Path, site: Site) -> None:
