@@ -23,7 +23,7 @@ test: test-environment  ## at most two minutes: 89 % of all tests; or just ARGS
 # Tests that no clock decides take only the processor time that the others leave; their output comes after theirs.
 test-all: test-environment  ## what is longer: first what can share the machine, then what measures real time
 	log=$$(mktemp); nice -n 19 $(PYTEST) -m "slow and computes and not alone and not long" --numprocesses auto \
-	  --dist worksteal >"$$log" 2>&1 & computing=$$!; \
+	  --dist worksteal >"$$log" 2>&1 & computing=$$!; trap "kill $$computing; exit 130" INT TERM; \
 	$(PYTEST) -m "slow and not computes and not alone and not long" --numprocesses auto --dist worksteal; shared=$$?; \
 	wait $$computing; computed=$$?; cat "$$log"; rm "$$log"; \
 	$(PYTEST) -m "alone and not long" && exit $$((shared | computed))
