@@ -7,7 +7,7 @@ import signal
 import threading
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 from pydantic import BaseModel
@@ -41,14 +41,9 @@ from sightline.protocol.log import start_log
 from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT, own_stop_addresses
 from sightline.protocol.transports.open import check_link, open_link
 from sightline.protocol.transports.security import ROBOT_ROLE
-from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.hardware.cameras.lens import LensConfig
-from sightline.robot_side.hardware.gpio import GpioDriveConfig
-from sightline.robot_side.plugins import DEVICE_GROUPS, DRIVES
-from sightline.sim.process import SimConfig
-from sightline.sim.robot import load_robot
-from sightline.sim.scenario import load_scenario
-from sightline.vision_side.config import VisionConfig
+
+if TYPE_CHECKING:
+    from sightline.robot_side.config import RobotConfig
 
 _log: Final = logging.getLogger(__name__)
 
@@ -158,6 +153,7 @@ def robot(
     if zero_motors:
         return set_to_zero(given)
     if given.motors.kind == "sim":
+        from sightline.robot_side.plugins import DRIVES
         from sightline.sim.bus import await_simulation
 
         await_simulation(DRIVES.load(given.motors)[1].socket_dir)
@@ -399,27 +395,42 @@ def check(service: ServiceName, file: File = None, profile: Profile = None, sets
 
 def _check_names(config: BaseModel) -> None:
     """Check that devices, scenario, robot, detectors and missions exist, and their options. Opens no device."""
-    if isinstance(config, RobotConfig):
-        from sightline.robot_side.guardian.start import zero_of
+    # Here, because each service starts a fifth sooner without the models of the others.
+    from sightline.robot_side.config import RobotConfig
+    from sightline.sim.process import SimConfig
+    from sightline.vision_side.config import VisionConfig
 
-        home_path(config.state_dir)
-        own_stop_addresses(config.listen)
-        check_link(config.doors, config.connect, ROBOT_ROLE, config.secure)
-        for group in DEVICE_GROUPS:
-            choice = config.devices[group.key]
-            options = group.load(choice)[1] if choice else None
-            if isinstance(options, LensConfig):
-                options.given_model()
-            if isinstance(options, GpioDriveConfig):
-                options.rows()
-        zero_of(config)
+    if isinstance(config, RobotConfig):
+        _check_devices(config)
     if isinstance(config, SimConfig):
+        from sightline.sim.robot import load_robot
+        from sightline.sim.scenario import load_scenario
+
         load_robot(config.robot or load_scenario(config.scenario).robot)
     if isinstance(config, VisionConfig):
         with needs("vision"):
             from sightline.vision_side.detect.registry import check_vision
         check_link(config.listen, config.connect, "vision", config.secure)
         check_vision(config)
+
+
+def _check_devices(config: "RobotConfig") -> None:
+    from sightline.robot_side.guardian.start import zero_of
+    from sightline.robot_side.hardware.cameras.lens import LensConfig
+    from sightline.robot_side.hardware.gpio import GpioDriveConfig
+    from sightline.robot_side.plugins import DEVICE_GROUPS
+
+    home_path(config.state_dir)
+    own_stop_addresses(config.listen)
+    check_link(config.doors, config.connect, ROBOT_ROLE, config.secure)
+    for group in DEVICE_GROUPS:
+        choice = config.devices[group.key]
+        options = group.load(choice)[1] if choice else None
+        if isinstance(options, LensConfig):
+            options.given_model()
+        if isinstance(options, GpioDriveConfig):
+            options.rows()
+    zero_of(config)
 
 
 def show(

@@ -571,6 +571,21 @@ def test_nothing_heavy_is_imported_before_it_is_needed(arguments):
     assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.parametrize(("command", "needs"), [
+    ("robot", {"robot_side"}), ("vision", {"vision_side"}), ("sim", {"sim", "robot_side"}), ("metrics", set())])
+def test_a_service_starts_without_the_configuration_of_the_others(command, needs):
+    script = (
+        "import sys; from sightline.operator_side.cli import app as cli; code = cli.run(sys.argv[1:]);"
+        "configs = ('robot_side.config', 'robot_side.ports', 'vision_side.config', 'sim.scenario');"
+        "print(code, *{name.split('.')[0] for name in configs if f'sightline.{name}' in sys.modules})"
+    )
+    wrong = ["--port", "0", "a/b"] if command == "metrics" else ["--set", "no_such_key=1"]
+    result = subprocess.run([sys.executable, "-P", "-c", script, command, *wrong], capture_output=True, text=True,
+                            check=True)
+    code, *imported = result.stdout.split()
+    assert (code, set(imported)) == ("2", needs), result.stderr
+
+
 @pytest.mark.waits
 @pytest.mark.parametrize(("command", "group", "libraries"), [
     ("stop", "app", ""), ("status", "app commands operate options", "typer"),
