@@ -46,6 +46,14 @@ def test_newest_other_python_is_used_in_its_own_environment(programs, step, goal
     assert ("demanded: nothing" in done.stdout) == (step == "test")
 
 
+def test_build_fails_where_the_environment_cannot_be_made(programs):
+    script(programs / "python3.13", "exit 0")
+    script(programs / "make", '[ "$2" != test-environment ]')
+    assert other_python("build", programs).returncode == 1
+    script(programs / "make", '[ "$2" = test-environment ]')
+    assert other_python("build", programs).returncode == 0, "tests that cannot be collected fail in their own step"
+
+
 def test_failed_tests_of_another_python_fail_the_step(programs):
     script(programs / "python3.13", "exit 0")
     script(programs / "make", "exit 2")
