@@ -351,21 +351,30 @@ def too_many_lost_commands(_bench: Bench, first: Sender) -> None:
     _expect_while_held("NOT_PROVEN", first, first)
 
 
-@SUITE.must("R-PROOF-14", "6.6 Proof", vision)
-def acquire_commits(bench: Bench, first: Sender) -> None:
+@SUITE.must("R-PROOF-14", "6.6 Proof", teleop)
+def acquire_commits(bench: Bench, human: Sender) -> None:
     """The proof of an `acquire` that takes the lease is a commitment: a twist with another proof is NOT_PROVEN."""
-    bench.need(first.granted("acquire") and _holder_is(first), "acquire takes no lease (R-LEASE-13)")
-    bench.expect((result := first.twist_result(proof=_FORGED)) == "NOT_PROVEN", f"the twist: {result}")
+    bench.need(human.granted("acquire") and _holder_is(human), "acquire takes no lease (R-LEASE-13)")
+    bench.expect((result := human.twist_result(proof=_FORGED)) == "NOT_PROVEN", f"the twist: {result}")
 
 
-@SUITE.must("R-PROOF-15", "6.6 Proof", ready)
-def request_uses_up_its_proof(bench: Bench, first: Sender) -> None:
+@SUITE.must("R-PROOF-15", "6.6 Proof", ready_human)
+def request_uses_up_its_proof(bench: Bench, human: Sender) -> None:
     """The proof of a granted request is the last one accepted: a twist that repeats it is NOT_PROVEN."""
     for verb in ("reset", "acquire"):
-        used = first.proofs.next().proof
-        bench.need(first.granted(verb, proof=used), f"{verb} is not granted (R-LEASE-13)")
-        _expect_while_held("NOT_PROVEN", first, first, f"a twist with the proof of {verb}", proof=used)
-        first.need_good()
+        used = human.proofs.next().proof
+        bench.need(human.granted(verb, proof=used), f"{verb} is not granted (R-LEASE-13)")
+        _expect_while_held("NOT_PROVEN", human, human, f"a twist with the proof of {verb}", proof=used)
+        human.need_good()
+
+
+@SUITE.must("R-PROOF-16", "6.6 Proof", vision)
+def keys_demand_proofs(bench: Bench, first: Sender) -> None:
+    """A twist and an `acquire` without a proof are NOT_PROVEN where peers show keys, also of a new session."""
+    bench.need(bench.access.is_guarded, "no keys were named (--secure, --token)")
+    first.expect("NOT_PROVEN", proof=None)
+    human = Sender(first.robot, "teleop", acks=False)
+    human.expect_rejected("acquire", "NOT_PROVEN", "an acquire without a proof", proof=None)
 
 
 @SUITE.must("R-PROOF-06", "6.6 Proof", ready)

@@ -93,7 +93,7 @@ export class Gate {
     const age_us = now_us - this.freshness.shownSince_us(header.echo.t_us);
     if (age_us > this.limits.zeroSpeedAge_us) throw new WireError("STALE", "the camera image does not change");
     const sender = { source, session: header.session };
-    this.lease.checkProof(sender, proofOf(header), now_us);
+    this.lease.checkProof(sender, proofOf(header), now_us, this.limits.needsProof);
     this.sequence.check(header, now_us);
     return { sender, age_us };
   }
@@ -176,7 +176,7 @@ export class Gate {
     if (!ALWAYS_GRANTED.includes(verb) && verb !== "release") this.issued.checkRequest(header.echo, now_us, MAX_REQUEST_AGE_US);
     this.noticeLostHuman(now_us);
     if (!ALWAYS_GRANTED.includes(verb)) {
-      this.lease.checkProof(sender, proofOf(header), now_us);
+      this.lease.checkProof(sender, proofOf(header), now_us, this.limits.needsProof && verb === "acquire");
       this.lease.advance(sender, proofOf(header), now_us);
     }
     switch (verb) {

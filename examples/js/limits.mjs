@@ -30,6 +30,7 @@ export const LIMITS = Object.freeze({
   guestUnchanged_us: 2_000_000,
   guestUnchanged_m: 0.25,
   autoArm: false,
+  needsProof: false, // true where peers show keys (6.6)
 });
 
 /** Compute the share of the speed limit for a frame of this age: 1 up to `fullSpeedAge_us`, then linearly down to 0. */

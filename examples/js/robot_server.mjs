@@ -134,7 +134,7 @@ class Server {
     this.latch = new Latch(options["state-dir"], options.robot);
     const session = randomBytes(4).toString("hex");
     const { pictures } = options;
-    const limits = { autoArm: options["auto-arm"], guests: options.guests };
+    const limits = { autoArm: options["auto-arm"], guests: options.guests, needsProof: options.token !== undefined };
     this.robot = new Robot({ session, fps: options.fps, camera: this.camera.model, live: pictures === undefined, limits, stopped: this.latch.isSet });
     this.hello = helloText(options.robot, session, WANTED_CHANNELS);
     this.peers = new Set();

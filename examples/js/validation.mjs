@@ -175,7 +175,8 @@ export class Lease {
   }
 
   /** Check that a message which names the holder is of the holder. @throws {WireError} NOT_PROVEN */
-  checkProof(sender, proof, now_us) {
+  checkProof(sender, proof, now_us, isNeeded = false) {
+    if (isNeeded && proof.proof === null) throw new WireError("NOT_PROVEN", "a robot with keys needs a proof in each command");
     if (!isSame(this.liveHolder(now_us), sender) || this.proof.proof === null || continues(proof.proof, this.proof)) return;
     throw new WireError("NOT_PROVEN", `its proof does not continue that of the ${sender.source} that drives`);
   }

@@ -35,7 +35,7 @@ from tests.conformance.robot.broken import (  # noqa: F401  (they fill BROKEN)
 )
 from tests.conformance.robot.broken.breaking import BROKEN as BROKEN_ROBOTS
 from tests.conformance.robot.broken.websocket import DEFECTS
-from tests.conformance.robot.reference import virtual_robot
+from tests.conformance.robot.reference import KEYED, virtual_robot
 from tests.conformance.vision import (  # noqa: F401  (they fill BROKEN)
     broken_answers,
     broken_flow,
@@ -146,10 +146,10 @@ class Stage:
         if peer in REAL_TIME:
             with self._on_sockets(peer, mutant) as (bench, prepare):
                 return run_case(case, bench, prepare)
-        bench, prepare = self._virtual(peer, mutant)
+        bench, prepare = self._virtual(peer, mutant, case)
         return run_case(case, bench, prepare)
 
-    def _virtual(self, peer, mutant):
+    def _virtual(self, peer, mutant, case):
         side = peer.removeprefix("javascript-")
         written = mutant if mutant is not None and mutant.operator == HAND_WRITTEN else None
         if peer == "vision":
@@ -158,7 +158,8 @@ class Stage:
             one = kind(network)
             bench = VirtualBench(network, [one], TO_ROBOT, access=KEYS)
         elif peer == "robot":
-            bench, one = virtual_robot(BROKEN_ROBOTS[written.caught_by[0]] if written else None)
+            break_it = BROKEN_ROBOTS[written.caught_by[0]] if written else None
+            bench, one = virtual_robot(break_it, keys=case.id in KEYED)
         else:
             bench, one = virtual_js(self._javascript(), side, self._modules(mutant))
         if mutant is not None and mutant.message:

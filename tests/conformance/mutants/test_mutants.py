@@ -10,6 +10,7 @@ from sightline.conformance.runner import Outcome
 from tests.conformance.mutants import peers
 from tests.conformance.mutants.operators import OPERATORS, OperatorError, change_function
 from tests.conformance.mutants.table import FAULTS, read_table
+from tests.conformance.robot.reference import KEYED
 from tests.conformance.vision.fixture import BY_BOXES
 from tests.fixtures.javascript import EXAMPLES
 
@@ -17,12 +18,12 @@ MUTANTS, PROBLEMS = peers.table()
 PYTHON = ("robot", "vision")
 JAVASCRIPT = ("javascript-robot", "javascript-vision")
 VIRTUAL = (*PYTHON, *JAVASCRIPT)
-NOT_APPLICABLE = {"javascript-robot": {"R-FRAM-11", *(f"R-LEASE-{number}" for number in range(21, 28))},
+NOT_APPLICABLE = {"javascript-robot": {"R-FRAM-11", *(f"R-LEASE-{number}" for number in range(21, 28)), *KEYED},
                   "javascript-vision": {*(f"V-REP-0{number}" for number in range(1, 7)),
                                         *(f"V-REQ-0{number}" for number in range(2, 6)), *BY_BOXES}}
-"""Cases that a peer's choices leave nothing to test in: the JavaScript robot publishes no scan, and has no Zenoh; the
-JavaScript vision service publishes no reports and no detections, knows no missions, and does not steer by the boxes of
-another peer."""
+"""Cases that a peer's choices leave nothing to test in: the JavaScript robot publishes no scan, and has no Zenoh and no
+keys here; the JavaScript vision service publishes no reports and no detections, knows no missions, and steers by no
+boxes of another peer."""
 
 
 AT_ONCE = 8

@@ -4,6 +4,7 @@ import array
 import math
 
 from sightline.conformance.benches import FROM_ROBOT, VirtualBench
+from sightline.conformance.case import Access
 from sightline.protocol.channels import ACK, FRAME, REQUEST, TWIST, key_for
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import CameraModel
@@ -19,6 +20,9 @@ MODEL = CameraModel(width_px=16, height_px=16, fx_px=20.0, fy_px=20.0, cx_px=8.0
 CAMERA_US = 1e6 / 30
 SCAN_US = 100_000
 STREAM_US = 200_000
+KEYS = Access({"vision": "0123456789abcdefABCDEF_-", "operator": "0123456789abcdefABCDEF_+"})
+KEYED = ("R-PROOF-16",)
+"""Cases about a robot with keys. A network in memory checks no token."""
 
 
 class ReferenceRobot:
@@ -129,11 +133,12 @@ class ReferenceRobot:
         self.sending.motion = self.driving.motion()
 
 
-def virtual_robot(break_it=None, **safety):
+def virtual_robot(break_it=None, *, keys=False, **safety):
     """(bench, robot): a fresh robot, broken by `break_it(robot)` if that is given, and the kit connected to it."""
     network = MemoryNetwork()
     network.advance(1_000_000)
     robot = ReferenceRobot(network, **safety)
+    robot.driving.gate._needs_proof = keys
     if break_it is not None:
         break_it(robot)
-    return VirtualBench(network, [robot], FROM_ROBOT), robot
+    return VirtualBench(network, [robot], FROM_ROBOT, access=KEYS if keys else None), robot

@@ -314,6 +314,11 @@ def requests_use_up_no_proof(robot):
     lease_of(robot, advance=lambda self, who, proof, now_us: None)
 
 
+@breaks("R-PROOF-16")
+def keys_demand_no_proof(robot):
+    robot.driving.gate._needs_proof = False
+
+
 @breaks("R-PROOF-13")
 def humans_need_no_proof(robot):
     proofs_of(robot, lambda lease, who, proof, now_us: proof.proof is None and who.source == "teleop")
