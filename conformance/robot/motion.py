@@ -68,8 +68,10 @@ def measures_what_it_applies(bench: Bench) -> None:
         found = {f"{field} of {name}": mean({name: series}) for name, series in robot.readings(began_us).items()
                  for field, mean in (("moving", mean_moving), ("pose", mean_travel))}
         bench.need(any(found.values()), "this robot publishes no measured motion")
-        frozen = found.get("pose of odometry") and not found.get("pose of frame") and robot.frames_give_a_pose()
-        bench.expect(not frozen, "`pose` of the frames stands still, that of odometry does not")
+        travels = {name: found[f"pose of {name}"] for name in ("odometry", "frame")
+                   if f"pose of {name}" in found and (name == "odometry" or robot.frames_give_a_pose())}
+        alike = len({travel is None for travel in travels.values()}) < 2
+        bench.expect(alike, f"`pose` moves on one channel and stands still on the other: {travels}")
         for name, measured in found.items():
             near = measured is None or all(map(_agrees, measured, applied, (_OFF_MPS, _OFF_RAD_S)))
             bench.expect(near, f"{text.decode()} is applied as {applied}, by {name} it moves at {measured}")

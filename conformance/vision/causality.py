@@ -30,6 +30,7 @@ SUITE = Suite("V")
 _BURST = 20
 _RECOVERS_US = 1_000_000
 _STARTING: Final = 10
+_LOST: Final = 30
 _HOUR_US: Final = 3_600_000_000
 _SECONDS_US: Final = 10_000_000
 _SEQ_LEAP: Final = 100_000
@@ -271,8 +272,12 @@ def session_stays(bench: Bench, robot: RobotPlayed) -> None:
 
 @SUITE.must("V-SEQ-02", "2.5 Session and sequence", met)
 def twists_count_up(bench: Bench, robot: RobotPlayed) -> None:
-    """The `seq` of its twists rises by at least one each."""
+    """The `seq` of its twists rises by at least one each, also where it sends each twice since frames are lost."""
     robot.film("left", 40)
+    for _ in range(_LOST):
+        robot.next_fields()  # a frame that does not arrive
+        robot.is_answered(robot.frame("left"))
+        bench.rest(FRAME_US)
     _rises(bench, robot.twists(), "twists")
 
 

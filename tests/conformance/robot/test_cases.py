@@ -99,11 +99,13 @@ def test_robot_with_a_wrong_stamp_on_one_channel_fails(name, channel, fields):
 
 
 @pytest.mark.parametrize("pose", [lambda x, y, yaw: [0, 0, 0], lambda x, y, yaw: [x, y, 57.3 * yaw]])
-def test_robot_whose_frames_have_another_pose_than_its_odometry_fails(pose):
-    def bend(header, _payload):
-        header["pose"] = pose(*header["pose"])
+@pytest.mark.parametrize("channel", ["frame", "odometry"])
+def test_robot_whose_frames_have_another_pose_than_its_odometry_fails(channel, pose):
+    def bend(header, payload):
+        fields = header if channel == "frame" else payload
+        fields["pose"] = pose(*fields["pose"])
 
-    result = result_of(CASES_BY_ID["R-LIM-08"], lambda robot: bend_out(robot, "frame", bend))
+    result = result_of(CASES_BY_ID["R-LIM-08"], lambda robot: bend_out(robot, channel, bend))
     assert result.outcome is Outcome.FAILED, result.reason
 
 

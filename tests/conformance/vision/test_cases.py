@@ -206,6 +206,22 @@ def test_one_vision_service_that_starts_again_is_not_two():
     assert len({one.fields["session"] for one in robot.answers()}) == 2
 
 
+def test_vision_service_that_repeats_a_twist_with_its_seq_while_frames_are_lost_fails():
+    class Copies(BrokenVision):
+        last = 0
+
+        def decides(self, header, answer):
+            self.lost, self.last = header.seq - self.last == 2, header.seq
+            return answer
+
+        def writes(self, fields, text):
+            for _ in range(1 + self.lost):
+                self.puts(fields, text)
+
+    result = result_of(next(case for case in VIRTUAL if case.id == "V-SEQ-02"), Copies)
+    assert (result.outcome, "twists came as" in result.reason) == (Outcome.FAILED, True), result.reason
+
+
 class NotFinite(BrokenVision):
     """Answers an image with a number that is not finite where the odometry or the lens is at its bounds."""
 
