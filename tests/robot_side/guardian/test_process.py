@@ -14,6 +14,7 @@ import pytest
 
 from sightline.evaluation.processes import is_running
 from sightline.operator_side.client.requests import Operator
+from sightline.operator_side.client.stop import stop_robot
 from sightline.protocol.clock import heartbeat_us
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import Verb
@@ -152,6 +153,21 @@ def test_driver_ramps_to_zero_and_ends_without_its_guardian(dying):
     assert until(lambda: not is_running(driver) and not is_running(network), START_S)
     check_stop(robot, fault)
     assert any(0 < left < 10 for t_us, left, _ in robot.motor_rows() if t_us > fault.t_us), "a ramp, not a jump"
+
+
+def test_robot_with_a_stopped_guardian_still_stops_by_silence_and_by_stop(tmp_path):
+    with RobotProcess(tmp_path) as robot:
+        with Vision(robot.endpoint):
+            assert driving(robot)
+            os.kill(robot.process.pid, signal.SIGSTOP)
+            since_us = heartbeat_us()
+            assert until(lambda: robot.motor_rows()[-1][0] > since_us + 500_000)
+            assert robot.speed() > 0.0, "the gate still checks each command"
+        since_us = heartbeat_us()
+        assert until(lambda: robot.speed() == 0.0, 3)
+        seconds, metres = stop_after(robot.motor_rows(), since_us)
+        assert seconds <= BOUND_S and metres <= BOUND_M
+        assert stop_robot("r1", [robot.endpoint], "", "", lambda: None), "and it is on disk"
 
 
 def test_nothing_moves_before_the_guardian_watches(tmp_path, monkeypatch):
