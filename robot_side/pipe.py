@@ -313,13 +313,17 @@ class DriverEnd:
             self._received, self._received_us = False, now_us
         if self._process is not None and self._was_ready and now_us - self._received_us > _WEDGED_US:
             self._process.kill()  # stopped or hung: a running process reports five times a second
-        if self._process is None and now_us >= self._start_at_us and not self.failed_at_start:
+        if self.is_start_due(now_us):
             self._received_us = now_us + _STARTS_WITHIN_US
             try:
                 self._start(first_seq)
             except OSError as error:
                 _log.info("network process does not start: %s; trying again", error.strerror)
                 self._start_at_us = now_us + _LONGEST_BACKOFF_US
+
+    def is_start_due(self, now_us: int) -> bool:
+        """Return True if `keep_alive` starts a process now. That waits until the child has a processor."""
+        return self._process is None and now_us >= self._start_at_us and not self.failed_at_start
 
     def _start(self, first_seq: int) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

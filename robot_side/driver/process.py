@@ -45,7 +45,7 @@ from sightline.robot_side.driver.supervision import (
     limit_core_dump,
     request_real_time,
 )
-from sightline.robot_side.guardian.core import AT_REST, ENDING, FAILED, LOST, MOVING, REJECTS_US
+from sightline.robot_side.guardian.core import AT_REST, ENDING, FAILED, IDLE, LOST, MOVING, REJECTS_US
 from sightline.robot_side.guardian.start import GuardianEnd, zero_of
 from sightline.robot_side.guardian.stop_core import DriverReport, pack_report, unpack_ignored, unpack_number
 from sightline.robot_side.pipe import DriverEnd
@@ -377,13 +377,24 @@ class Driver:
             self._guardian.beat(self._heartbeat())
         for message in self._driver_core.messages(now_us):
             self.driver_end.send(ipc.pack_message(ipc.PacketKind.PUBLISH, message))
-        self.driver_end.keep_alive(heartbeat_us(), self._driver_core.gate.issued.last_seq("frame") + 1)
+        self._keep_network(heartbeat_us())
         self._driver_core.network_restarts = max(0, self.driver_end.restarts)
         self.latch_writer.want(self._driver_core.gate.state is State.STOPPED)
         self._log_state(self._driver_core.gate.state, self._driver_core.gate.reason)
         self._log_battery(now_us)
         self._log_wheel(now_us)
         self._report_stop(now_us)
+
+    def _keep_network(self, now_us: int) -> None:
+        """Start the network process if it is not running."""
+        # On a busy machine a start takes long, and the guardian would end a healthy loop. Meanwhile the wheels stand.
+        guardian = self._guardian if self._is_at_rest else None
+        may_wait = guardian is not None and self.driver_end.is_start_due(now_us)
+        if guardian is not None and may_wait:
+            guardian.beat(IDLE)
+        self.driver_end.keep_alive(now_us, self._driver_core.gate.issued.last_seq("frame") + 1)
+        if guardian is not None and may_wait:
+            guardian.beat(AT_REST)
 
     def _answer(self) -> None:
         """Send command acks after the wheels are set. The motion comes first, for the header of the next frame.

@@ -25,6 +25,7 @@ from sightline.robot_side.guardian.core import (
     AT_REST,
     ENDING,
     FAILED,
+    IDLE,
     LOST,
     MOVING,
     WATCHED,
@@ -281,6 +282,21 @@ def test_last_heartbeat_permits_a_long_end_only_after_zero(run_with, loop, beat)
         assert unpack_beat(ours.recv(16))[0] == beat
         with suppress(BlockingIOError):
             assert ours.recv(16) == b"", "no other heartbeat follows"
+
+
+@pytest.mark.parametrize(("at_rest", "runs", "beats"), [
+    (True, False, [AT_REST, IDLE, "start", AT_REST]), (True, True, [AT_REST]), (False, False, [MOVING, "start"]),
+])
+def test_start_of_the_network_process_may_wait_for_a_processor_only_at_rest(driver, monkeypatch, at_rest, runs, beats):
+    done = []
+    monkeypatch.setattr(driver, "_guardian", SimpleNamespace(beat=done.append))
+    monkeypatch.setattr(driver.driver_end, "_start", lambda _first_seq: done.append("start"))
+    monkeypatch.setattr(driver.driver_end, "_process", SimpleNamespace(poll=lambda: None) if runs else None)
+    if not at_rest:
+        driver._driver_core.gate.applied = Twist(linear_mps=0.3, angular_rad_s=0.0)
+        driver._driver_core.gate._ramp.force(driver._driver_core.gate.applied)
+    driver._tick(20_000)
+    assert done == beats
 
 
 def test_a_latch_that_cannot_be_written_is_tried_again_and_does_not_block(tmp_path, caplog):
