@@ -194,6 +194,7 @@ def test_hanging_reading_has_the_age_of_its_start_and_its_thread_closes_the_devi
     battery = HungBattery()
     reader = BatteryReader(battery)
     assert until(lambda: battery.readings == 2)
+    monkeypatch.setattr("sightline.robot_side.driver.process._BATTERY_PERIOD_S", 10.0)  # no third reading
     begun_us, first = monotonic_us(), reader.newest
     battery.go_on.set()
     assert until(lambda: reader.newest != first)
