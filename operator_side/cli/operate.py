@@ -291,6 +291,9 @@ def goto(
         return CHECK_FAILED if cannot(report) else code
 
 
+_MAX_WAYPOINTS_BYTES = 1_000_000
+
+
 def _waypoints(numbers: list[str], file: Path | None) -> "Waypoints":
     from sightline.operator_side.client.missions import waypoints_of, waypoints_of_file
 
@@ -299,7 +302,11 @@ def _waypoints(numbers: list[str], file: Path | None) -> "Waypoints":
     if numbers:
         raise ConfigError("waypoints on the command line and --file exclude each other; remove one")
     try:
-        return waypoints_of_file(home_path(file).read_text("utf-8"), str(file))
+        with home_path(file).open("rb") as opened:
+            content = opened.read(_MAX_WAYPOINTS_BYTES + 1)
+        if len(content) > _MAX_WAYPOINTS_BYTES:  # e.g. /dev/zero
+            raise ConfigError(f"cannot read {file}: more than {_MAX_WAYPOINTS_BYTES} bytes; name a file of waypoints")
+        return waypoints_of_file(content.decode("utf-8-sig"), str(file))
     except (OSError, UnicodeDecodeError) as error:
         why = getattr(error, "strerror", None) or "not a text file"
         raise ConfigError(f"cannot read {file}: {why}; name a file with one waypoint X Y per line") from None

@@ -1,7 +1,10 @@
 """Waypoints and options of a mission request, and its reports as text."""
 
+from pathlib import Path
+
 import pytest
 
+from sightline.operator_side.cli import operate
 from sightline.operator_side.client.missions import (
     cannot,
     mission_line,
@@ -50,6 +53,25 @@ def test_invalid_waypoint_is_named(texts, words):
 def test_a_file_of_waypoints_names_its_line(text, words):
     with pytest.raises(ConfigError, match=words.replace("(", r"\(")):
         waypoints_of_file(text, "way.txt")
+
+
+@pytest.mark.parametrize(("content", "found"), [
+    (b"\xef\xbb\xbf1.5 2\r\n", ((1.5, 2.0),)), (b"1 2\n#" + b" " * 999_995, ((1.0, 2.0),)),
+    (b"1 2\n#" + b" " * 999_996, "cannot read .*way.txt: more than 1000000 bytes; name a file of waypoints"),
+    (b"\xff\xfe1 2", "cannot read .*way.txt: not a text file; name a file with one waypoint X Y per line"),
+])
+def test_file_of_waypoints_is_text_of_a_bounded_size(tmp_path, content, found):
+    (file := tmp_path / "way.txt").write_bytes(content)
+    if isinstance(found, tuple):
+        assert operate._waypoints([], file) == found
+    else:
+        with pytest.raises(ConfigError, match=found):
+            operate._waypoints([], file)
+
+
+def test_endless_file_of_waypoints_is_rejected():
+    with pytest.raises(ConfigError, match="cannot read /dev/zero: more than 1000000 bytes"):
+        operate._waypoints([], Path("/dev/zero"))
 
 
 def test_options_are_read_as_toml_values():
