@@ -28,6 +28,8 @@ UNEXPECTED: Final = 1
 USAGE: Final = 2
 
 _UNKNOWN_COMMAND = re.compile(r"No such command '([^']*)'")
+_VALIDATION = re.compile("Value error, |, unable to parse string as an? [a-z]+")
+"""What the validation of a value adds to its reason."""
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -192,6 +194,7 @@ def _unexpected(error: Exception, arguments: Sequence[str]) -> int:
 
 def _usage_line(text: str, context: "typer.Context | None", arguments: Sequence[str]) -> str:
     """Add the nearest command of the same group to a usage error about a command."""
+    text = _VALIDATION.sub("", text).replace("Input should be", "expected")
     unknown = _UNKNOWN_COMMAND.match(text)
     path = context.command_path if context else _command_path(arguments)
     if unknown is None:

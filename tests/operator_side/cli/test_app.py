@@ -257,6 +257,14 @@ def test_command_whose_standard_streams_are_closed_has_the_null_device_and_so_ha
         (["config", "check", "vision", "--set", "detector.shadow=adaptve"], 2, "did you mean 'adaptive'"),
         (["config", "check", "vision", "--set", "detector.kind=hsv", "--set", "detector.device=cuda"], 2, "no device"),
         (["config", "check", "vision", "--set", "detector.kind=boxes", "--set", "detector.tracked=true"], 2, "tracked"),
+        *((arguments.split(), 2, f"Invalid value for '{option}': {what}; see sightline {command} --help")
+          for arguments, option, what, command in (
+            ("sim --seed x", "--seed", "expected a valid integer", "sim"),
+            ("demo --latency-ms 1,5", "--latency-ms", "expected a valid number", "demo"),
+            ("watch --port -1", "--port", "expected greater than or equal to 0", "watch"),
+            ("keys add keys robot --days 0", "--days", "expected greater than or equal to 1", "keys add"),
+            ("train --device foo", "--device", "'foo' is not one of 'cpu', 'cuda'", "train"),
+        )),
         (["robot", "--robot", "a/b"], 2, "'a/b'"),
         (["robot", "--robot", "*"], 2, "'*'"),
         (["calibrate", "camera", "--robot", "r1", "--secure", "no-such-folder"], 2, "no-such-folder"),
