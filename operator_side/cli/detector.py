@@ -4,6 +4,7 @@ import json
 import math
 import os
 import shlex
+import threading
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any
@@ -53,6 +54,8 @@ Metrics = Annotated[
     str | None,
     typer.Option("--metrics", metavar="[HOST:]PORT", help="Serve /metrics, /live, /ready at this port, e.g. 9466."),
 ]
+_LISTED_S = 30.0
+"""Longest time of one plug-in in the list: its import may load a large package."""
 _REMOTE = ("zenoh", "boxes")
 _RECOMMENDED = (
     ("balls, legs and traffic lights", "onnx"),
@@ -148,7 +151,7 @@ def list_detectors(as_json: Json = False) -> int:
     with needs("vision"):
         from sightline.vision_side.detect.registry import REGISTRY
     with plugin_prints(as_json):
-        rows = [(name, _problem(REGISTRY, name)) for name in REGISTRY.names()]
+        rows = [(name, _problem_in_time(REGISTRY, name)) for name in REGISTRY.names()]
     model = _shipped_model()
     if as_json:
         listed = [{"name": name, "usable": not why, "why": why} for name, why in rows]
@@ -169,6 +172,15 @@ def _shipped_model() -> str:
     except ImportError:  # the list reports the missing package
         return ""
     return shipped_digest()
+
+
+def _problem_in_time(registry: "PluginRegistry", name: str) -> str:
+    """Return why a detector does not work here. A plug-in that hangs delays the list once and hides no other."""
+    answers: list[str] = []
+    read = threading.Thread(target=lambda: answers.append(_problem(registry, name)), name="detector", daemon=True)
+    read.start()
+    read.join(_LISTED_S)
+    return answers[0] if answers else f"its import or missing() does not return within {_LISTED_S:g} s; fix the plug-in"
 
 
 def _problem(registry: "PluginRegistry", name: str) -> str:

@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -273,3 +274,14 @@ def test_example_detector_keeps_the_contract(capsys, monkeypatch) -> None:
     monkeypatch.syspath_prepend(str(Path.cwd()))
     code, out, _ = run(capsys, "detector", "check", "my_detector:BrightestSpot", "--set", "least=150", "--json")
     assert code == 0, out
+
+
+def test_detector_list_names_a_plug_in_that_hangs_and_lists_the_others(capsys, monkeypatch) -> None:
+    goes_on = threading.Event()
+    monkeypatch.setattr(Hsv, "missing", lambda: goes_on.wait(20), raising=False)
+    monkeypatch.setattr(cli_detector, "_LISTED_S", 0.2)
+    code, out, _ = run(capsys, "detector", "list", "--json")
+    goes_on.set()
+    why = {one["name"]: one["why"] for one in json.loads(out)["detectors"]}
+    assert code == 0 and why["hsv"] == "its import or missing() does not return within 0.2 s; fix the plug-in"
+    assert why["zenoh"] == why["adaptive"] == ""
