@@ -524,11 +524,13 @@ def test_result_with_a_number_that_json_lacks_is_valid_json(capsys, number):
 
 @pytest.mark.parametrize(("service", "given", "why"), [
     *((service, given, why) for service in ("robot", "vision") for given, why in (
-        ('secure = "/no keys"', "ca.pem is missing in /no keys"),
+        ('secure = "/no keys"',
+         "ca.pem is missing in /no keys"),
         ('secure = "KEYS"\nlisten = ["tcp/127.0.0.1:1"]', "tcp/127.0.0.1:1 has no TLS"),
         ('listen = ["ws://0.0.0.0:9090"]', "accepts network clients without a token; pass --secure"),
         ('listen = ["wss://0.0.0.0:9090"]\nconnect = []\nsecure = "KEYS"', None),
-        ('listen = []\nconnect = ["wss://robot:9090"]\nsecure = "/no keys"', "ca.pem is missing in /no keys; copy it from the folder of `sightline keys init`"),
+        ('listen = []\nconnect = ["wss://robot:9090"]\nsecure = "/no keys"',
+         "ca.pem is missing in /no keys; copy it from the folder of `sightline keys init`"),
         ('listen = ["tls/0.0.0.0:7447"]\nconnect = []\nsecure = "KEYS"', None),
     )),
     ("robot", 'listen = ["ws-legacy://0.0.0.0:9091"]', "list their addresses, legacy.allow_from"),
