@@ -267,7 +267,10 @@ def _rows(outputs: Arrays, masks: int) -> _Columns:
     if rows.ndim < 2 or rows.shape[-1] != 6 + masks:
         raise ValueError(f"an output of {rows.shape}")
     rows = _bounded(rows.reshape(-1, 6 + masks).astype(np.float64))
-    return rows[:, :4], rows[:, 4], rows[:, 5]
+    scores, labels = rows[:, 4], rows[:, 5]
+    if (labels % 1 > 0).any() and not (scores % 1 > 0).any():
+        raise ValueError("each row has its class before its score; expected x1, y1, x2, y2, score, class")
+    return rows[:, :4], scores, labels
 
 
 def _yolo(outputs: Arrays, masks: int) -> _Columns:

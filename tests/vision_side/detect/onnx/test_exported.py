@@ -129,6 +129,26 @@ def test_box_that_ends_before_it_begins_is_an_error(box: tuple) -> None:
         read(triple((100, 300, 140, 340), box), TRIPLE)
 
 
+@pytest.mark.parametrize("rows", [
+    [(100, 300, 140, 340, 0, 0.9)], [(100, 300, 140, 340, 1, 0.9), (0, 0, 0, 0, 0, 0)],
+    [(100, 300, 140, 340, 0, 0.2), (200, 300, 240, 340, 7, 1.0)],
+])
+def test_rows_with_the_class_before_the_score_are_an_error(rows: list) -> None:
+    """Before, class 0 was a score of 0, so that the answer was "saw nothing", and class 1 a score of 1."""
+    form = form_of((1, 300, 6))
+    with pytest.raises(ValueError, match="class before its score; expected x1, y1, x2, y2, score, class"):
+        read({"output0": np.array([rows], np.float32)}, form)
+    right = np.array([rows], np.float32)[..., [0, 1, 2, 3, 5, 4]]
+    assert {one.label for one in read({"output0": right}, form)} == {str(row[4]) for row in rows if row[5] > 0.25}
+
+
+@pytest.mark.parametrize(("row", "count"), [
+    ((100, 300, 140, 340, 1, 2), 1), ((100, 300, 140, 340, 0.9, 1.98), 1), ((0, 0, 0, 0, 0, 0), 0),
+])
+def test_rows_of_whole_scores_or_of_a_quantized_class_count(row: tuple, count: int) -> None:
+    assert len(read({"output0": np.array([[row]], np.float32)}, form_of((1, 300, 6)))) == count
+
+
 def test_boxes_that_do_not_count_or_have_no_area_change_nothing() -> None:
     thing, flat, corner = (100, 300, 140, 340), (300, 300, 299.1, 310), (0.1, 0.1, 0.9, 0.9)
     assert len(read(triple(thing, (200, 180, 40, 40), corner, scores=(0.9, 0.2, 0.2)), TRIPLE)) == 1
