@@ -303,6 +303,8 @@ class UltralyticsDetector(FrameworkDetector):
         def find(bgr: NDArray[Any]) -> Arrays:
             (result,) = model.predict(bgr, conf=max(least, 0.001), device=device, verbose=False, retina_masks=True)
             boxes, masks = result.boxes, result.masks
+            if boxes is None:
+                raise ValueError("it gives no boxes; use a model for the task detect or segment")
             found = {"boxes": _array(boxes.xyxy), "scores": _array(boxes.conf), "labels": _array(boxes.cls)}
             return found if masks is None else {**found, "masks": _array(masks.data)}
 

@@ -123,6 +123,15 @@ def test_ultralytics_boxes_and_names_become_detections(monkeypatch, tmp_path: Pa
     assert detector.maker.detector == "ultralytics:m.onnx" and len(detector.maker.model_hash) == 16
 
 
+def test_model_of_ultralytics_without_boxes_names_the_tasks_that_have_some(monkeypatch, tmp_path: Path) -> None:
+    """A model of the task obb or classify: the result has `boxes` None. Before, the line named `xyxy`."""
+    fake_ultralytics(monkeypatch, None)
+    sys.modules["ultralytics"].YOLO("").predict = lambda image, **_: [SimpleNamespace(boxes=None, masks=None)]
+    (tmp_path / "m.onnx").write_bytes(b"any")
+    assert "it gives no boxes; use a model for the task detect or segment" in rejected(
+        UltralyticsDetector, address=str(tmp_path / "m.onnx"))
+
+
 @pytest.mark.parametrize("name", ["m.pt", "m.pth", "m.yaml", "yolo11n", "m.engine"])
 def test_all_but_exported_models_of_ultralytics_may_run_code(monkeypatch, tmp_path: Path, name: str) -> None:
     fake_ultralytics(monkeypatch, None)
