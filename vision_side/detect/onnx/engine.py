@@ -69,7 +69,7 @@ class ModelEngine(Protocol):
 
 
 def _tensors(slots: Iterable[Any]) -> tuple[Tensor, ...]:
-    return tuple(Tensor(one.name, _TYPES.get(one.type, "other"), tuple(map(_size, one.shape))) for one in slots)
+    return tuple(Tensor(one.name, _TYPES.get(one.type, one.type), tuple(map(_size, one.shape))) for one in slots)
 
 
 def _size(dimension: object) -> int | None:

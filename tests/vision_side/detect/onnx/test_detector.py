@@ -257,6 +257,16 @@ def test_model_of_another_kind_names_the_expected_kind() -> None:
         model_format(OnnxHeader((image,), (Tensor("y", "float32", (None, 6)),), {"labels": "{"}), (), "auto")
 
 
+@pytest.mark.parametrize(("number", "name"), [(11, "double"), (3, "int8"), (4, "uint16")])
+def test_type_that_no_input_may_have_is_named(tmp_path: Path, number: int, name: str) -> None:
+    """Before, each of them was "other"."""
+    shape = b"".join(part(1, part(1, size)) for size in (1, 3, 8, 8))
+    image = part(1, "x") + part(2, part(1, part(1, number) + part(2, shape)))
+    path = model(tmp_path / "m.onnx", [node("Identity", ["x"], ["y"])], [], [image], [image.replace(b"x", b"y", 1)])
+    with pytest.raises(ConfigError, match=rf"its input is tensor\({name}\) \(1, 3, 8, 8\); it should be uint8"):
+        detector(path)
+
+
 FORM = ModelFormat(False, False, (240, 320), "triple", ("ball",))
 STRAIGHT = Letterbox(1.0, 0, 0)
 
