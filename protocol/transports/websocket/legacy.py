@@ -196,10 +196,10 @@ class LegacyCommands:
         self._last_us = self._zeros = self._closed_by_text = 0
         self._unreadable = ""
 
-    def received(self, fault: str = "") -> None:
+    def received(self, fault: str = "", fix: str = "it must send each image as base64 text and nothing else") -> None:
         """Note an image, or why a message is not an image. Logs the first of several faults in a row."""
         if fault and not self._unreadable:
-            self._log(f"robot at {self._endpoint}: {fault}; it must send each image as base64 text and nothing else")
+            self._log(f"robot at {self._endpoint}: {fault}; {fix}")
         self._unreadable = fault
 
     def sent(self, text: bytes, now_us: int) -> None:

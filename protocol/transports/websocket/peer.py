@@ -156,6 +156,9 @@ class Peer:
             self._wire.linger()
         except ConnectionClosed as closed:
             count_close(closed, reject)
+            if self._commands is not None and closed.sent is not None and closed.sent.code == 1009:
+                self._commands.received(f"a message is too large: {closed.sent.reason}",
+                                        "let it send smaller images, or raise max_frame_bytes")
         finally:
             self._wire.shut()
             self._gone.set()

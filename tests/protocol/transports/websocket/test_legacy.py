@@ -459,6 +459,18 @@ def test_invalid_image_ends_the_connection_which_recovers(message, code, counted
         assert until(lambda: robot.send(TEXT) or frames.take(0.05))
 
 
+def test_robot_whose_images_are_too_large_is_reported_once(caplog):
+    """Before, the vision service only reported that no frames come."""
+    with old_robot_and_vision() as (robot, vision):
+        for count in (1, 2):
+            with suppress(ConnectionClosed):
+                robot.send("A" * 10_000_000)
+            assert until(lambda expected=count: vision.rejected == {OVERSIZE: expected} and robot.clients)
+        lines = [one.getMessage() for one in caplog.records]
+    assert len(lines) == 1 and "a message is too large: " in lines[0]
+    assert lines[0].startswith("robot at ws-legacy://") and lines[0].endswith("or raise max_frame_bytes")
+
+
 def test_a_robot_may_send_an_image_with_its_answer_to_the_handshake():
     endpoint, connections, images = free_endpoint("ws-legacy://"), [], []
 
