@@ -226,3 +226,19 @@ def test_error_of_building_a_detector_ends_the_check(error: BaseException) -> No
 
     with pytest.raises(type(error), match=str(error)):
         check_detector(make, 3)
+
+
+@pytest.mark.parametrize(("answers", "failed"), [
+    (tuple, {"order": "an empty batch gets (); expected []"}),
+    (lambda given: (None,) * len(given), {"order": "an empty batch gets (); expected []",
+                                          "answering": "no answer to image 0 of 320x240",
+                                          "silence": "no answer to a good frame after a bad one"}),
+])  # fmt: skip
+def test_results_in_a_tuple_are_reported_and_each_other_promise_is_checked(answers, failed) -> None:
+    """Before, a tuple without an answer had answered every image, and bytes that are not an image got an answer."""
+
+    class InTuple(Broken):
+        def detect(self, frames, deadline_us):
+            return answers(super().detect(frames, deadline_us))
+
+    assert {one.name: one.wrong for one in check_detector(InTuple) if one.wrong} == failed
