@@ -44,6 +44,8 @@ SESSION_BEGINS: Final = "5ca1"
 _GUID: Final = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 _SEND_S: Final = 2.0
 _REQUEST_BYTES: Final = 16_384
+_LONG_BLOCK_BYTES: Final = 570
+"""Without its channel more than the 512 bytes of a header, and within the 576 bytes of a block."""
 
 
 class RawServer:
@@ -245,6 +247,12 @@ def _channel(data: bytes) -> object:
     return _fields(data[2 : 2 + int.from_bytes(data[:2])]).get("channel")
 
 
+def _echo(data: bytes) -> dict[str, Any]:
+    """Return the echo of a binary message, or an empty object."""
+    echo = _fields(data[2 : 2 + int.from_bytes(data[:2])]).get("echo")
+    return echo if isinstance(echo, dict) else {}
+
+
 # --- opening ---------------------------------------------------------------------------------------------------------
 
 
@@ -345,6 +353,22 @@ def reads_fragments(bench: Bench) -> None:
         client.send(CONTINUED, whole[100:2_000], fin=False)
         client.send(CONTINUED, whole[2_000:])
         bench.expect(_answer(client) is not None, "it did not answer")
+
+
+@SUITE.must("V-SOCK-24", "1.4 Sizes", real=True)
+def rejects_long_headers(bench: Bench) -> None:
+    """A frame whose header has over 512 bytes, in a block within 576, drives nothing."""
+    with server_of(bench) as server:
+        client = met(bench, server)
+        client.send(BINARY, _frame(client, 1))
+        bench.need(_answer(client) is not None, "it did not answer an ordinary frame (V-SOCK-06)")
+        whole = _frame(client, 2)
+        size = int.from_bytes(whole[:2])
+        block = whole[2 : 2 + size].ljust(_LONG_BLOCK_BYTES)
+        client.send(BINARY, len(block).to_bytes(2) + block + whole[2 + size :])
+        drove = client.frame_that(lambda one: one.opcode == BINARY and _channel(one.data) == "twist"
+                                  and _echo(one.data).get("seq") == 2, _ANSWER_S)
+        bench.expect(drove is None, f"it drove by a frame with a header block of {len(block)} bytes")
 
 
 @SUITE.should("V-SOCK-22", "19.2 Only while watched", real=True)
