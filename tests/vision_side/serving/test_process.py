@@ -3,10 +3,12 @@
 import sys
 import threading
 import time
-from types import SimpleNamespace
+from contextlib import nullcontext
 
 import pytest
 
+from sightline.protocol.errors import ConfigError
+from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.serving import process
 from sightline.vision_side.serving.service import ServingState
 
@@ -84,9 +86,28 @@ def test_service_watches_its_turns_and_passes_its_state_on(monkeypatch) -> None:
     for name in ("configured_mission", "configured_detector", "close_detector", "date_problem"):
         monkeypatch.setattr(process, name, lambda *_: "")
     monkeypatch.setattr(process, "_run_one", lambda _config, _ending, observe, *_: observe(state) or 0)
-    config = SimpleNamespace(secure="", robot="r1", share=SimpleNamespace(enabled=False), listen=())
+    config = VisionConfig()
     assert process.run(config) == process.run(config, observed.append) == 0
     assert watched == [state, state] and observed == [state]
+
+
+@pytest.mark.parametrize("error", [None, ConfigError("no such file")])
+@pytest.mark.parametrize(("slow_s", "lines"), [(0.01, ["vision: waiting for the detector hsv to load"]), (0.15, [])])
+def test_detector_that_loads_slowly_is_named_until_it_is_loaded(monkeypatch, caplog, slow_s, lines, error) -> None:
+    def build(_config: VisionConfig) -> str:
+        time.sleep(0.1)
+        if error is not None:
+            raise error
+        return "detector"
+
+    caplog.set_level("INFO")
+    monkeypatch.setattr(process, "_SLOW_S", slow_s)
+    monkeypatch.setattr(process, "configured_detector", build)
+    config = VisionConfig(detector=DetectorConfig(kind="hsv"))
+    with pytest.raises(ConfigError) if error else nullcontext():
+        assert process._loaded_detector(config) == "detector"
+    time.sleep(0.1)
+    assert caplog.messages == lines
 
 
 @pytest.mark.parametrize(("file", "place"), [
