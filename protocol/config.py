@@ -134,7 +134,7 @@ class PluginRegistry:
         """Check the options of `plugin` and return its `Config`. Raises ConfigError for an invalid option."""
         settings = config_model(plugin)
         if settings is None:
-            raise ConfigError(f"{self.noun} {kind!r}: {plugin!r} has no pydantic model called Config")
+            raise ConfigError(f"{self.noun} {kind!r}: not a class with a pydantic model called Config")
         try:
             return settings.model_validate(options)
         except ValidationError as error:

@@ -164,7 +164,7 @@ def test_fallback_has_the_same_label_filter() -> None:
         ({"kind": "onx:models/ball.onnx"}, "no detector called 'onx:models/ball.onnx'; did you mean 'onnx'?"),
         ({"kind": "http://box/detect"}, "no detector called 'http://box/detect'; did you mean 'oip+http'?; there are"),
         ({"kind": f"{__name__}:Gone"}, "cannot be loaded"),
-        ({"kind": f"{__name__}:NoConfig"}, "no pydantic model called Config"),
+        ({"kind": f"{__name__}:NoConfig"}, "NoConfig': not a class with a pydantic model called Config"),
         ({"kind": "hsv:red"}, "takes nothing after its name, not 'red'"),
         ({"kind": "hsv", "options": {"hue": 3}}, "unknown option 'hue'; it takes hsv, label"),
         ({"kind": "onnx:/nowhere/ball.onnx"}, "No such file"),

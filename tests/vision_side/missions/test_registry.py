@@ -84,7 +84,7 @@ class Stepless:
     ("folow", {}, "no mission called 'folow'; did you mean 'follow'?"),
     ("os:nothing", {}, "cannot be loaded"),
     ("no_such_package:Name", {}, "cannot be loaded: No module named"),
-    ("math:pi", {}, "no pydantic model called Config"),
+    ("math:pi", {}, "mission 'math:pi': not a class with a pydantic model called Config"),
     (f"{__name__}:Stepless", {}, "has no method step(): docs/how-to/write-a-mission.md"),
     ("band", {"centre_shere": 0.1}, "unknown option 'centre_shere'; it takes"),
     ("band", {"centre_share": 3}, "option 'centre_share': Input should be less than or equal to 1"),
