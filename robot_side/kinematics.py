@@ -110,11 +110,12 @@ _LATEST_US = 100_000  # between two calls; a robot that was suspended for longer
 class WheelMonitor:
     """Compares the encoder of one wheel with its commanded speed."""
 
+    jumped: bool
+    """True if the last reading was further from the one before than a wheel can turn. `look` sets it."""
+
     def __init__(self, max_rad_s: float) -> None:
         """Begin. `max_rad_s`: highest commanded speed. Pushed or downhill, a wheel may be twice as fast."""
         self._max_rad_s = 2 * max_rad_s
-        self.jumped = False
-        """True if the last reading was further from the one before than a wheel can turn."""
         self._last: tuple[float, int] | None = None
         self._from_rad = self._commanded_rad = 0.0
         self._since_us = 0
