@@ -207,6 +207,16 @@ def test_the_next_rate_is_taken_from_where_the_last_ended():
     assert odometer((0.0, 0.0, 0), (1.0, 1.0, 50_000), (1.0, 1.0, 100_000)).moving == (0.0, 0.0)
 
 
+def test_restart_continues_at_the_same_pose_and_rate_from_another_reading():
+    for left_rad, right_rad in ((1000.0, -1000.0), (0.0, 0.0), (-5.0, 1e6)):
+        jumped, straight = odometer((0.0, 0.0, 0), (1.0, 3.0, 50_000)), odometer((0.0, 0.0, 0), (1.0, 3.0, 50_000))
+        jumped.restart(WheelAngles(left_rad, right_rad, 100_000))
+        assert (jumped.pose, jumped.moving) == (straight.pose, straight.moving)
+        jumped.update(WheelAngles(left_rad + 1.0, right_rad + 2.0, 150_000))
+        straight.update(WheelAngles(2.0, 5.0, 100_000))
+        assert jumped.pose == pytest.approx(straight.pose) and jumped.moving == pytest.approx(straight.moving)
+
+
 # --- encoders that contradict the commands -----------------------------------------------------------------------
 
 
@@ -297,6 +307,15 @@ def test_wheel_that_is_not_commanded_is_not_compared():
 def test_encoder_that_jumps_or_wraps_is_named_once(jump, speed):
     [(at_s, doubt)] = doubts_of(lambda _: speed, lambda true, at_s: true + jump * (at_s >= 3), seconds=4)
     assert at_s == 3.0 and doubt.startswith("left wheel jumped by ") and "look for a loose wire" in doubt
+
+
+@pytest.mark.parametrize("jumps", [(9.0, 0.0), (0.0, -9.0), (9.0, 9.0)])
+def test_jump_of_either_wheel_is_known_until_the_next_reading(jumps):
+    monitor, seen = EncoderMonitor(DRIVE), []
+    for t_us, angles in ((0, (0.0, 0.0)), (20_000, (0.0, 0.0)), (40_000, jumps), (60_000, jumps)):
+        monitor.look((0.0, 0.0), WheelAngles(*angles, t_us), t_us)
+        seen.append(monitor.jumped)
+    assert seen == [False, False, True, False]
 
 
 @pytest.mark.parametrize("max_rad_s", [5.0, 22.0, 100.0])
