@@ -224,6 +224,7 @@ def test_busy_motors_are_the_reason_whatever_was_sent_meanwhile(sim, commands):
         second.set(3.0, 4.0)
 
 
+@pytest.mark.alone
 def test_drive_opens_in_time_when_the_simulation_hangs(sim):
     sim.process.send_signal(signal.SIGSTOP)
     begin_s = time.monotonic()
