@@ -5,6 +5,7 @@ The guardian imports this module alone, so it needs no pydantic.
 
 import socket
 import struct
+import time
 from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any, Final
@@ -19,8 +20,6 @@ _ANSWER_S: Final = 1.0
 _FREE_S: Final = 0.1
 _QUERY: Final = b"?"
 """A packet that is not a command: it changes no speed, and its answer shows whether the motors have an owner."""
-_MOST_ANSWERS: Final = 200
-"""Bound of the encoder readings that come meanwhile, 100 per second."""
 
 
 def zero(config: Mapping[str, Any]) -> None:
@@ -42,11 +41,13 @@ def check_free(folder: str) -> None:
 def _offer(folder: str, packet: bytes, answer_s: float) -> None:
     """Send one packet on a connection of its own. Raises HardwareError for an owner, OSError without an answer."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+        ends_s = time.monotonic() + answer_s
         connection.settimeout(answer_s)
         connection.connect(f"{folder}/{MOTION}")
         connection.send(packet)
         connection.shutdown(socket.SHUT_WR)
-        for _ in range(_MOST_ANSWERS):  # until the simulation has read all of it
+        while (left_s := ends_s - time.monotonic()) > 0:  # until it has read all; encoder readings come first
+            connection.settimeout(left_s)
             answer = connection.recv(64)
             if answer == MOTION_BUSY:
                 raise HardwareError(f"another process owns the simulated motors in {folder}; end it")
