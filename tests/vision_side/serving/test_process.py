@@ -3,6 +3,7 @@
 import sys
 import threading
 import time
+from collections.abc import Iterable, Iterator
 from contextlib import nullcontext
 
 import pytest
@@ -10,74 +11,74 @@ import pytest
 from sightline.protocol.errors import ConfigError
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.serving import process
-from sightline.vision_side.serving.service import ServingState
+from sightline.vision_side.serving.service import LIVE_S, ServingState
+from tests.fixtures.links import until
 
 
 class Plugin:
     """A detector that waits in its own code, or in code of Python that it calls."""
 
     def __init__(self) -> None:
-        self.left = threading.Event()
+        self.began, self.left = threading.Event(), threading.Event()
 
     def detect(self, in_python: bool) -> None:
+        self.began.set()
         if in_python:
-            self.left.wait(10)
+            self.left.wait(30)
         while not self.left.is_set():
             time.sleep(0.001)
 
 
-class Loop:
-    """The loop of a service on a thread of its own, with a plug-in."""
+class Looks(threading.Event):
+    """The end of a service whose watcher looks whenever the test says so: no test waits, and none is too late."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, look_s: float) -> None:
-        monkeypatch.setattr(process, "_LOOK_S", look_s)
-        monkeypatch.setattr(process, "LIVE_S", 5 * look_s)
-        self.state = ServingState(list, threading.Event(), 0.0, lambda: True)
-        self.lines: list[str] = []
-        self.plugin = Plugin()
+    def __init__(self) -> None:
+        super().__init__()
+        self.state = ServingState(list, self, 0.0, lambda: True)
+        self.turned: Iterator[bool] = iter(())
 
-    def end(self) -> None:
-        self.state.ending.set()
-        self.watching.join(5)
+    def wait(self, _seconds: float | None = None) -> bool:
+        """Turn before this look, or not, as `turned` says; after the last look the service ends."""
+        if (turns := next(self.turned, None)) is None:
+            return True
+        self.state.turned_s += turns
+        return False
 
-    def wait_lines(self, count: int) -> None:
-        ends_s = time.monotonic() + 5
-        while len(self.lines) < count and time.monotonic() < ends_s:
-            time.sleep(0.002)
 
-    def hang(self, in_python: bool) -> None:
-        self.watching = process.watch_turns(self.state, self.lines.append)
-        self.plugin.detect(in_python)
-        while self.state.turns():
-            time.sleep(0.001)
+def reported(turned: Iterable[bool], thread: int) -> list[str]:
+    lines: list[str] = []
+    looks = Looks()
+    looks.turned = iter(turned)
+    process._report_hangs(looks.state, thread, lines.append)
+    return lines
 
 
 @pytest.mark.parametrize("in_python", [False, True])
-def test_turn_that_hangs_is_logged_once_with_its_place_and_its_end(monkeypatch, in_python: bool) -> None:
-    loop = Loop(monkeypatch, 0.01)
-    hanging = threading.Thread(target=loop.hang, args=(in_python,), daemon=True)
+def test_turn_that_hangs_is_logged_once_with_its_place_and_its_end(in_python: bool) -> None:
+    plugin = Plugin()
+    hanging = threading.Thread(target=plugin.detect, args=(in_python,), daemon=True)
     hanging.start()
-    loop.wait_lines(1)
-    time.sleep(0.1)
-    (line,) = loop.lines
-    assert line.startswith(f"vision: no turn ended for 0.05 s: it hangs in Plugin.detect() of {__file__}:")
-    loop.plugin.left.set()
-    loop.wait_lines(2)
-    (line,) = loop.lines[1:]
-    assert 0.05 <= float(line.removeprefix("vision: the turn ended after ").removesuffix(" s")) < 5
-    loop.end()
-    hanging.join(5)
-    assert not (loop.watching.is_alive() or hanging.is_alive()) and len(loop.lines) == 2
+    assert plugin.began.wait(30) and hanging.ident is not None
+    most = round(LIVE_S / process._LOOK_S)
+    lines = reported([True, *[False] * (most + 2), True, True], hanging.ident)
+    plugin.left.set()
+    hanging.join(30)
+    assert len(lines) == 2
+    assert lines[0].startswith(f"vision: no turn ended for {LIVE_S:g} s: it hangs in Plugin.detect() of {__file__}:")
+    assert lines[1] == f"vision: the turn ended after {LIVE_S + 2 * process._LOOK_S:g} s"
 
 
-def test_turns_that_end_log_nothing(monkeypatch) -> None:
-    loop = Loop(monkeypatch, 0.02)
-    watching = loop.watching = process.watch_turns(loop.state, loop.lines.append)
-    for _ in range(30):
-        loop.state.turns()
-        time.sleep(0.01)
-    loop.end()
-    assert loop.lines == [] and not watching.is_alive()
+def test_turns_that_end_log_nothing() -> None:
+    slow = [*[False] * (round(LIVE_S / process._LOOK_S) - 1), True]
+    assert reported(3 * slow, threading.get_ident()) == []
+
+
+def test_watcher_ends_with_the_service() -> None:
+    state = ServingState(list, threading.Event(), 0.0, lambda: True)
+    state.ending.set()
+    watching = process.watch_turns(state, str)
+    watching.join(30)
+    assert not watching.is_alive() and watching.daemon
 
 
 def test_service_watches_its_turns_and_passes_its_state_on(monkeypatch) -> None:
@@ -92,21 +93,21 @@ def test_service_watches_its_turns_and_passes_its_state_on(monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("error", [None, ConfigError("no such file")])
-@pytest.mark.parametrize(("slow_s", "lines"), [(0.01, ["vision: waiting for the detector hsv to load"]), (0.15, [])])
-def test_detector_that_loads_slowly_is_named_until_it_is_loaded(monkeypatch, caplog, slow_s, lines, error) -> None:
+@pytest.mark.parametrize("lines", [["vision: waiting for the detector hsv to load"], []])
+def test_detector_that_loads_slowly_is_named_until_it_is_loaded(monkeypatch, caplog, lines, error) -> None:
     def build(_config: VisionConfig) -> str:
-        time.sleep(0.1)
+        assert until(lambda: caplog.messages == lines)
         if error is not None:
             raise error
         return "detector"
 
     caplog.set_level("INFO")
-    monkeypatch.setattr(process, "_SLOW_S", slow_s)
+    monkeypatch.setattr(process, "_SLOW_S", 0.01 if lines else 60.0)
     monkeypatch.setattr(process, "configured_detector", build)
-    config = VisionConfig(detector=DetectorConfig(kind="hsv"))
+    config, before = VisionConfig(detector=DetectorConfig(kind="hsv")), threading.active_count()
     with pytest.raises(ConfigError) if error else nullcontext():
         assert process._loaded_detector(config) == "detector"
-    time.sleep(0.1)
+    assert until(lambda: threading.active_count() <= before), "nothing waits any more"
     assert caplog.messages == lines
 
 
