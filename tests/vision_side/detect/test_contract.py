@@ -19,6 +19,7 @@ from sightline.vision_side.detect.registry import build_detector
 from sightline.vision_side.detect.remote.fallback import Fallback
 from sightline.vision_side.detect.shadow import ShadowDetector
 from tests.contracts.detectors import assert_kept
+from tests.fixtures.links import until
 
 CONFIG = VisionConfig()
 
@@ -211,11 +212,11 @@ def test_detector_that_hangs_breaks_the_promise_and_ends_the_check(monkeypatch, 
 
     def hang(*_given: object) -> None:
         began.append(place)
-        left.wait(5)
+        left.wait(30)
 
     (result,) = check_detector(type("Hanging", (Broken,), {place: hang}), 3)
     assert (result.name, result.wrong) == ("order", "it takes more than 0.05 s; the rest was not checked")
-    assert began == [place]
+    assert until(lambda: began == [place])
     left.set()
 
 
