@@ -18,6 +18,7 @@ _CATCH_UP_US: Final = 1_000_000
 _STEADY: Final = 60
 _STEADY_IN_TIME: Final = 0.9
 """Share of the frames, one at a time: a scheduler may delay some."""
+_PATIENCE_US: Final = 5_000_000
 
 
 SUITE.must_all(met, {
@@ -54,14 +55,14 @@ def slow_robot(bench: Bench, robot: RobotPlayed) -> None:
 @SUITE.must("V-FLOW-05", "7.1 Answers", met)
 def steady(bench: Bench, robot: RobotPlayed) -> None:
     """Sixty frames, each after the answer to the last, are all answered, and nine of ten within half a second."""
-    sent = robot.film("left", _STEADY)
-    bench.rest(ANSWER_US)
-    late_us = [min((answer.received.at_us - one.at_us for answer in robot.answers_to(one)), default=None)
-               for one in sent]
-    missing = late_us.count(None)
-    bench.expect(not missing, f"{missing} of {len(sent)} frames got no answer")
-    in_time = sum(took_us is not None and took_us <= ANSWER_US for took_us in late_us)
-    bench.expect(in_time >= _STEADY_IN_TIME * len(sent), f"{in_time} of {len(sent)} frames were answered in time")
+    in_time = 0
+    for number in range(1, _STEADY + 1):
+        sent = robot.frame("left")
+        bench.rest(FRAME_US)
+        # A next frame would replace one that a service without a processor has not taken up, and end its claim (7.1).
+        bench.expect(robot.is_answered(sent, _PATIENCE_US), f"frame {number} of {_STEADY} got no answer")
+        in_time += robot.answers_to(sent)[0].received.at_us - sent.at_us <= ANSWER_US
+    bench.expect(in_time >= _STEADY_IN_TIME * _STEADY, f"{in_time} of {_STEADY} frames were answered in time")
 
 
 @SUITE.must("V-FLOW-06", "10.1 Camera, odometry, scan")

@@ -98,6 +98,26 @@ def test_vision_service_with_a_slow_detector_fails_no_must_case(cases, look_us):
     assert [(one.case.id, one.reason) for one in results if one.outcome is Outcome.FAILED] == []
 
 
+class WithoutProcessor(VirtualVision):
+    """Gets no processor for 0.7 s after its 20th answer, and answers no frame that a newer one replaced (7.1)."""
+
+    count = paused_us = 0
+
+    def tick(self, now_us):
+        if now_us >= self.paused_us:
+            super().tick(now_us)
+
+    def _publish(self, *answer):
+        super()._publish(*answer)
+        self.count += 1
+        self.paused_us = self.now_us + 700_000 if self.count == 20 else 0
+
+
+def test_vision_service_that_replaces_frames_while_it_has_no_processor_passes():
+    result = result_of(next(case for case in VIRTUAL if case.id == "V-FLOW-05"), WithoutProcessor)
+    assert (result.outcome, result.reason) == (Outcome.PASSED, "")
+
+
 class StrictClock(VirtualVision):
     """Rejects a frame that runs over 500 ms ahead of what the fastest frame or status of its session allows (2.6)."""
 
