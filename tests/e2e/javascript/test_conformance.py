@@ -16,6 +16,10 @@ CONFORM = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "confo
 NOT_APPLICABLE = (
     "over WebSocket nothing is sent under a key",
     "no token was named",
+    "no keys were named",
+    "it publishes no reports",
+    "it publishes no detections",
+    "it does not steer by the boxes of `detector`",
     "this robot publishes no scans",
     "the robot declares no liveliness token",
     "no port of the legacy protocol was named",
