@@ -30,7 +30,7 @@ class Plugin:
 
 
 class Looks(threading.Event):
-    """The end of a service whose watcher looks whenever the test says so: no test waits, and none is too late."""
+    """The end of a service whose watcher looks without a clock, so that no test is too late."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -38,7 +38,7 @@ class Looks(threading.Event):
         self.turned: Iterator[bool] = iter(())
 
     def wait(self, _seconds: float | None = None) -> bool:
-        """Turn before this look, or not, as `turned` says; after the last look the service ends."""
+        """Turn before this look if `turned` has a True for it. After the last look the service ends."""
         if (turns := next(self.turned, None)) is None:
             return True
         self.state.turned_s += turns
@@ -104,10 +104,15 @@ def test_detector_that_loads_slowly_is_named_until_it_is_loaded(monkeypatch, cap
     caplog.set_level("INFO")
     monkeypatch.setattr(process, "_SLOW_S", 0.01 if lines else 60.0)
     monkeypatch.setattr(process, "configured_detector", build)
-    config, before = VisionConfig(detector=DetectorConfig(kind="hsv")), threading.active_count()
+    made: list[threading.Timer] = []
+    usual = threading.Timer
+    monkeypatch.setattr(threading, "Timer", lambda *given: made.append(usual(*given)) or made[-1])
+    config = VisionConfig(detector=DetectorConfig(kind="hsv"))
     with pytest.raises(ConfigError) if error else nullcontext():
         assert process._loaded_detector(config) == "detector"
-    assert until(lambda: threading.active_count() <= before), "nothing waits any more"
+    (waiting,) = made
+    waiting.join(30)
+    assert not waiting.is_alive()
     assert caplog.messages == lines
 
 
