@@ -227,7 +227,7 @@ def record(link: Link, pictures: Pictures, path: Path, wanted: Channel, seconds:
 @contextmanager
 def _locked(target: Path) -> Iterator[None]:
     """Lock the file of a recording, because a second one would replace it. Raises ConfigError if it is locked."""
-    number = os.open(target, os.O_RDONLY | os.O_CREAT, 0o666)
+    number = os.open(target, os.O_RDONLY | os.O_CREAT | os.O_NONBLOCK, 0o666)  # a pipe must not wait for a writer
     try:
         with suppress(OSError):  # a file system without locks
             try:

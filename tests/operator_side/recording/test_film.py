@@ -341,6 +341,12 @@ def test_second_recording_of_one_file_is_rejected_and_the_first_is_complete(tmp_
     assert [one.message for one in read_recording(path)] == [status(3)]
 
 
+def test_recording_to_a_pipe_ends_with_one_line(tmp_path: Path) -> None:
+    os.mkfifo(path := tmp_path / "run.mcap")
+    with pytest.raises(ConfigError, match=f"recording {path} ends early: Illegal seek"):
+        record(robot := Talking([status(1)]), robot, path, FRAME, 0.01)
+
+
 def test_recording_needs_no_locks_of_the_file_system(monkeypatch, tmp_path: Path) -> None:
     def without_locks(*_given) -> None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
