@@ -93,7 +93,7 @@ def _check(ended: "queue.SimpleQueue[str | BaseException]", check: "_Check", mak
         finally:
             close_detector(detector)
         ended.put(wrong)
-    except PLUGIN_ERRORS as error:
+    except BaseException as error:  # any, because the caller waits for it
         ended.put(error)
 
 

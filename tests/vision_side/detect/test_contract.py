@@ -220,7 +220,8 @@ def test_detector_that_hangs_breaks_the_promise_and_ends_the_check(monkeypatch, 
     left.set()
 
 
-@pytest.mark.parametrize("error", [ConfigError("no such file"), OSError("no device"), SystemExit("3")])
+@pytest.mark.parametrize("error", [
+    ConfigError("no such file"), OSError("no device"), SystemExit("3"), GeneratorExit("odd")])
 def test_error_of_building_a_detector_ends_the_check(error: BaseException) -> None:
     def make() -> Broken:
         raise error
