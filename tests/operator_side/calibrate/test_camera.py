@@ -36,8 +36,6 @@ from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 from tests.operator_side.calibrate.board import BOARD, TRUTH, VIEWS, draw_board, rays, tilted_view, turned
 
-pytestmark = pytest.mark.computes
-
 SIZE = JpegSize(TRUTH.width_px, TRUTH.height_px, 3)
 EMPTY = jpeg_of(np.full((TRUTH.height_px, TRUTH.width_px, 3), 120, np.uint8))
 
