@@ -38,6 +38,12 @@ def twist_of(drive: DiffDriveConfig, left_rad_s: float, right_rad_s: float) -> T
     return Twist(linear_mps=(left_mps + right_mps) / 2, angular_rad_s=(right_mps - left_mps) / drive.track_width_m)
 
 
+def check_finite(wheels: WheelAngles) -> None:
+    """Raise ValueError for an angle that is not finite."""
+    if not (math.isfinite(wheels.left_rad) and math.isfinite(wheels.right_rad)):
+        raise ValueError(f"invalid wheel angles ({wheels.left_rad}, {wheels.right_rad}): not finite")
+
+
 class Odometer:
     """Dead reckoning from wheel angles: exact for arcs of constant curvature between two readings."""
 
@@ -64,8 +70,7 @@ class Odometer:
         Raises:
             ValueError: an angle is not finite.
         """
-        if not (math.isfinite(wheels.left_rad) and math.isfinite(wheels.right_rad)):
-            raise ValueError(f"invalid wheel angles ({wheels.left_rad}, {wheels.right_rad}): not finite")
+        check_finite(wheels)
         if self._last is None or self._rate_from is None:
             self._last = self._rate_from = wheels
             return

@@ -27,7 +27,7 @@ from sightline.protocol.messages import (
 from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import Message
 from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.kinematics import EncoderMonitor, Odometer, wheel_speeds
+from sightline.robot_side.kinematics import EncoderMonitor, Odometer, check_finite, wheel_speeds
 from sightline.robot_side.pipe import CommandAck, RobotMotion
 from sightline.robot_side.ports import Ranges, WheelAngles
 from sightline.robot_side.safety.battery import BatteryMonitor
@@ -156,6 +156,7 @@ class DriverCore:
         if wheels is not None:
             if (ahead_us := wheels.t_us - now_us) > _AHEAD_US:
                 raise ValueError(f"WheelAngles.t_us is {ahead_us / 1e6:.3g} s ahead; take the robot's clock")
+            check_finite(wheels)
             speeds = wheel_speeds(self.config.wheels, self.gate.applied)
             self.doubtful_wheel = self._encoders.look(speeds, wheels, now_us)
             (self.odometer.restart if self._encoders.jumped else self.odometer.update)(wheels)

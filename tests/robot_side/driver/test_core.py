@@ -227,6 +227,21 @@ def test_jump_of_an_encoder_does_not_enter_the_odometry(side, jump_rad, back_at)
     assert true.pose[0] > 0.07
 
 
+@pytest.mark.parametrize("broken", [math.inf, -math.inf, math.nan])
+def test_angle_that_is_not_finite_is_an_error_and_no_jump(broken):
+    core = core_of()
+    for step, angle_rad in enumerate([0.0, 0.04, broken, broken, 0.08]):
+        wheels = WheelAngles(angle_rad, 0.04, NOW_US + step * 20_000)
+        if math.isfinite(angle_rad):
+            core.tick(wheels.t_us, wheels, None)
+        else:
+            with pytest.raises(ValueError, match="not finite"):
+                core.tick(wheels.t_us, wheels, None)
+        assert core.doubtful_wheel == ""
+    core.tick(wheels.t_us + 20_000, WheelAngles(50.0, 0.04, wheels.t_us + 20_000), None)
+    assert "left wheel jumped" in core.doubtful_wheel
+
+
 def test_tick_reads_the_wheels_and_the_motion_is_bounded():
     core = core_of()
     assert core.motion() == RobotMotion() and core.at_rest
