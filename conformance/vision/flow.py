@@ -59,7 +59,7 @@ def steady(bench: Bench, robot: RobotPlayed) -> None:
     for number in range(1, _STEADY + 1):
         sent = robot.frame("left")
         bench.rest(FRAME_US)
-        # A next frame would replace one that a service without a processor has not taken up, and end its claim (7.1).
+        # A later frame would replace one that waits for a service without a processor, which need not answer it (7.1).
         bench.expect(robot.is_answered(sent, _PATIENCE_US), f"frame {number} of {_STEADY} got no answer")
         in_time += robot.answers_to(sent)[0].received.at_us - sent.at_us <= ANSWER_US
     bench.expect(in_time >= _STEADY_IN_TIME * _STEADY, f"{in_time} of {_STEADY} frames were answered in time")
