@@ -39,6 +39,8 @@ _OTHER_SESSION: Final = "fffffff0"
 _MAX_FIRST_SEQ: Final = 2**32
 _MAX_SEQ_STEP: Final = 2**20
 _MEASURED: Final = 5
+_TRIES: Final = 3
+"""A load that begins between the two measurements delays the large image alone."""
 _MEASURABLE_US: Final = 10_000
 """A smaller difference between two medians may come from the machine."""
 _COMMENTS: Final = 3
@@ -173,12 +175,16 @@ def compute_time_is_in_microseconds(bench: Bench, _robot: RobotPlayed) -> None:
     large = gray(LARGE_CAMERA)
     small = picture("absent")
     padded = commented(small, _COMMENTS, (len(large) - len(small)) // _COMMENTS)  # as long on the link as the large one
-    (took_us, computed_us), (longer_us, more_us) = (
-        _times_us(bench, *one) for one in ((LENS, padded), (LARGE_CAMERA, large)))
-    later_us = longer_us - took_us
-    bench.expect(later_us < _MEASURABLE_US or more_us - computed_us >= later_us / 2,
-                 f"a large image is answered {later_us:.0f} us later than a small one, and `compute_us` rises from "
+    wrong = ""
+    for _ in range(_TRIES):
+        (took_us, computed_us), (longer_us, more_us) = (
+            _times_us(bench, *one) for one in ((LENS, padded), (LARGE_CAMERA, large)))
+        later_us = longer_us - took_us
+        if later_us < _MEASURABLE_US or more_us - computed_us >= later_us / 2:
+            return
+        wrong = (f"a large image is answered {later_us:.0f} us later than a small one, and `compute_us` rises from "
                  f"{computed_us:.0f} to {more_us:.0f}")
+    bench.expect(False, wrong)
 
 
 def _times_us(bench: Bench, camera: CameraModel, jpeg: bytes) -> tuple[float, float]:

@@ -118,6 +118,30 @@ def test_vision_service_that_replaces_frames_while_it_has_no_processor_passes():
     assert (result.outcome, result.reason) == (Outcome.PASSED, "")
 
 
+class Loaded(BrokenVision):
+    """Answers its 13th to 30th image 60 ms later, while other programs have the processor."""
+
+    count = 0
+    later = None
+
+    def writes(self, fields, text):
+        self.count += 1
+        if 13 <= self.count <= 30:
+            self.later = (self.now_us + 60_000, fields, text)
+        else:
+            self.puts(fields, text)
+
+    def idle(self):
+        if self.later is not None and self.now_us >= self.later[0]:
+            self.puts(*self.later[1:])
+            self.later = None
+
+
+def test_vision_service_that_is_delayed_for_a_while_states_a_true_computing_time():
+    result = result_of(next(case for case in VIRTUAL if case.id == "V-CAUS-22"), Loaded)
+    assert (result.outcome, result.reason) == (Outcome.PASSED, "")
+
+
 class StrictClock(VirtualVision):
     """Rejects a frame that runs over 500 ms ahead of what the fastest frame or status of its session allows (2.6)."""
 
