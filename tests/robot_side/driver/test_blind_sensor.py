@@ -62,7 +62,7 @@ def test_robot_whose_sensor_turns_blind_while_it_drives_stays_in_fault(tmp_path)
             assert until(lambda: vision.status().state is State.FAULT and robot.speed() == 0.0, 5)
             seen, operator = vision.status(), Operator(vision.link)
             assert "below 1.13 m" in seen.reason and seen.faults == {"range sensor": seen.faults["range sensor"]}
-            assert operator.reset().ok
+            assert until(lambda: operator.reset().ok), "a request may come too late on a busy machine"
             assert until(lambda: vision.status().state is State.FAULT, 5)
             since_us = monotonic_us()
             time.sleep(0.3)
