@@ -155,6 +155,7 @@ def test_driver_ramps_to_zero_and_ends_without_its_guardian(dying):
     assert any(0 < left < 10 for t_us, left, _ in robot.motor_rows() if t_us > fault.t_us), "a ramp, not a jump"
 
 
+@pytest.mark.alone
 def test_robot_with_a_stopped_guardian_still_stops_by_silence_and_by_stop(tmp_path):
     with RobotProcess(tmp_path) as robot:
         with Vision(robot.endpoint):
