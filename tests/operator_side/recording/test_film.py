@@ -76,6 +76,15 @@ def test_ctrl_c_ends_a_film_and_before_its_first_image_the_command(tmp_path: Pat
     assert film(pictures, tmp_path / "run.mp4", FRAME, 0.9).frames == 2
 
 
+@pytest.fixture
+def hangs_up() -> Iterator[None]:
+    """SIGHUP ends this process, also under `nohup`."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.usefixtures("hangs_up")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_terminated_film_is_kept_as_after_ctrl_c(tmp_path: Path, number: signal.Signals) -> None:
     class Terminated(Played):
@@ -293,6 +302,7 @@ def test_recording_has_each_message_of_its_time(tmp_path: Path, wanted) -> None:
     assert read_about(path) == {"robot": "r1"} and recorder.counts == {"status": 2, "frame": 1}
 
 
+@pytest.mark.usefixtures("hangs_up")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_ended_recording_is_kept(tmp_path: Path, number: signal.Signals) -> None:
     robot = Talking([status(1)], [status(2), lambda: signal.raise_signal(number)], [status(3)])

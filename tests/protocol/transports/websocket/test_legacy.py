@@ -463,9 +463,11 @@ def test_robot_whose_images_are_too_large_is_reported_once(caplog):
     """Before, the vision service only reported that no frames come."""
     with old_robot_and_vision() as (robot, vision):
         for count in (1, 2):
+            (client,) = robot.clients
             with suppress(ConnectionClosed):
                 robot.send("A" * 10_000_000)
-            assert until(lambda expected=count: vision.rejected == {OVERSIZE: expected} and robot.clients)
+            assert until(lambda expected=count: vision.rejected == {OVERSIZE: expected})
+            assert until(lambda closed=client: robot.clients and closed not in robot.clients)
         lines = [one.getMessage() for one in caplog.records]
     assert len(lines) == 1 and "a message is too large: " in lines[0]
     assert lines[0].startswith("robot at ws-legacy://") and lines[0].endswith("or raise max_frame_bytes")
