@@ -19,7 +19,7 @@ NOT_APPLICABLE = (
     "no keys were named",
     "it publishes no reports",
     "it publishes no detections",
-    "it does not steer by the boxes of `detector`",
+    "it does not steer by the boxes of",
     "this robot publishes no scans",
     "the robot declares no liveliness token",
     "no port of the legacy protocol was named",
