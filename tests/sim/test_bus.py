@@ -215,6 +215,7 @@ def test_busy_motors_are_the_reason_whatever_was_sent_meanwhile(sim, commands):
     owner.set(1.0, 2.0)
     eventually(sim.rows)
     sim.process.send_signal(signal.SIGSTOP)
+    os.waitid(os.P_PID, sim.process.pid, os.WSTOPPED)
     for _ in range(commands):
         second.set(3.0, 4.0)
     sim.process.send_signal(signal.SIGCONT)
