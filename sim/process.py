@@ -25,6 +25,7 @@ from pydantic import Field
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError, HardwareError, home_path, install_command
+from sightline.robot_side.hardware.cameras.timing import JUST_NOW_S
 from sightline.sim.bus import (
     CAMERA,
     MOTION_ANGLES,
@@ -58,6 +59,27 @@ class PeriodicTimer:
         """Return True once per period."""
         count = int(now_us / self._period_us)
         is_due, self._count = count > self._count, count
+        return is_due
+
+
+class CaptureTimer:
+    """Permits one image per period: at its begin, or up to `JUST_NOW_S` later for a camera that requests it late.
+
+    Otherwise a robot that is slightly late would get only every second image. A real camera keeps its newest image for
+    the same time.
+    """
+
+    def __init__(self, period_us: float) -> None:
+        self._timer = PeriodicTimer(period_us)
+        self._until_us = -1
+
+    def due(self, now_us: int, *, requested: bool) -> bool:
+        """Return True if an image is to be drawn now. `requested`: a camera waits for one."""
+        if self._timer.due(now_us):
+            self._until_us = now_us + round(JUST_NOW_S * 1e6)
+        is_due = requested and now_us <= self._until_us
+        if is_due:
+            self._until_us = -1
         return is_due
 
 
@@ -389,7 +411,7 @@ class Simulation:
         self._motors = MotorPort(config.motor_log)
         self._clients = BusClients(folder, self._hellos(), self._motors.take)
         self._encoders, self._truth = PeriodicTimer(ENCODERS_US), PeriodicTimer(TRUTH_US)
-        self._frames = PeriodicTimer(1e6 / (config.fps or world.robot.camera.fps))
+        self._captures = CaptureTimer(1e6 / (config.fps or world.robot.camera.fps))
         self._scans = PeriodicTimer(1e6 / world.robot.lidar.rate_hz)
         self._offset_us = monotonic_us()
         self._lag_us = 0
@@ -435,18 +457,18 @@ class Simulation:
         if self._encoders.due(now_us):
             angles = self._world.wheel_angles()
             self._clients.send(MOTION, MOTION_ANGLES.pack(angles.left_rad, angles.right_rad, t_us))
-        if self._frames.due(now_us):
-            self._draw(t_us)
+        requested = self._clients.wanted_pictures()
+        if self._captures.due(now_us, requested=bool(requested)):
+            self._draw(t_us, requested)
         if self._scans.due(now_us) and self._clients.has(RANGE):
             self._clients.send(RANGE, self._scan(t_us))
         if self._truth.due(now_us) and self._clients.has(TRUTH):
             truth = replace(self._world.truth(), t_us=t_us, lag_us=self._lag_us)
             self._clients.send(TRUTH, truth.to_json())
 
-    def _draw(self, t_us: int) -> None:
+    def _draw(self, t_us: int, requested: set[tuple[int, int]]) -> None:
         """Draw an image for each requested encoding, usually one."""
-        requested = self._clients.wanted_pictures()
-        if requested and self._world.scenario.labels and self._clients.has(TRUTH):
+        if self._world.scenario.labels and self._clients.has(TRUTH):
             self._clients.send(TRUTH, to_json(self._world.labels(), t_us, self._world.camera_model.width_px))
         for wanted in requested:
             self._clients.send_picture(wanted, PICTURE_HEAD.pack(t_us, wanted[1]) + self._world.render(*wanted))

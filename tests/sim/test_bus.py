@@ -121,7 +121,7 @@ def test_pictures_are_fresh_distinct_and_paced(sim):
         assert picture.t_us > before_us - 8_000  # drawn after the request, except for the current step
         ages_us.append(time.monotonic_ns() // 1000 - picture.t_us)
         stamps.append(picture.t_us)
-    gaps_us = [later - earlier for earlier, later in pairwise(stamps)]
+    gaps_us = [later - earlier for earlier, later in pairwise(stamps[1:])]  # the first request may be late
     assert min(gaps_us) >= 28_000
     assert sorted(ages_us)[7] < 30_000
 
@@ -130,7 +130,7 @@ def test_pictures_come_at_the_requested_rate(tmp_path):
     simulator = started(tmp_path, fps=10.0)
     try:
         camera = SimCamera(simulator.config())
-        stamps = [camera.read(1.0).t_us for _ in range(4)]
+        stamps = [camera.read(1.0).t_us for _ in range(5)][1:]  # the first request may be late
     finally:
         simulator.process.kill()
         simulator.process.wait(10)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sightline.protocol.errors import ConfigError
-from sightline.sim.process import PeriodicTimer
+from sightline.sim.process import CaptureTimer, PeriodicTimer
 from sightline.sim.robot import load_robot
 from sightline.sim.scenario import ClosedPath, OnPath, PathLeg, Place, load_scenario, look_named, scenario_names
 from sightline.sim.toml_file import read_table
@@ -195,3 +195,27 @@ def test_a_cadence_keeps_its_rate_on_average(rate_hz, seconds):
     assert abs(len(due) - rate_hz * seconds) <= 1
     gaps_us = [b - a for a, b in pairwise(due)]
     assert max(gaps_us) - min(gaps_us) <= 4000
+
+
+def captures(waits_us, seconds):
+    """Return the times of the images of a camera that requests each one a wait after the one before."""
+    timer, requested_us, drawn_us = CaptureTimer(1e6 / 30), 0, []
+    for now_us in range(4000, seconds * 1_000_000 + 4000, 4000):
+        if timer.due(now_us, requested=now_us >= requested_us):
+            requested_us = now_us + waits_us[len(drawn_us) % len(waits_us)]
+            drawn_us.append(now_us)
+    return drawn_us
+
+
+@pytest.mark.parametrize("wait_us", range(32_000, 40_001, 1000))
+def test_a_camera_that_is_slightly_late_does_not_lose_every_second_image(wait_us):
+    assert len(captures([wait_us], 10)) >= 200, "every second image: 150"
+
+
+@given(st.lists(st.integers(0, 120_000), min_size=1))
+def test_a_capture_is_of_the_begin_of_its_period_and_the_only_one_of_it(waits_us):
+    drawn_us = captures(waits_us, 3)
+    periods = [int(now_us * 30 / 1e6) for now_us in drawn_us]
+    assert len(set(periods)) == len(periods)
+    late_us = [now_us - period * 1e6 / 30 for now_us, period in zip(drawn_us, periods, strict=True)]
+    assert max(late_us) <= 8_000 + 4_000, "a step of the physics is 4 ms"

@@ -94,7 +94,7 @@ def read_clocks() -> Clocks:
 # The newest image of a camera with its own capture thread. Shell (a lock and a clock).
 
 
-_JUST_NOW_S = 0.008
+JUST_NOW_S = 0.008
 """Largest age of a stored image that `read` returns. With a longer time it returns old images instead of the next one.
 With a shorter time, a reader that is slightly late gets only every second image."""
 
@@ -117,7 +117,7 @@ class LatestPicture:
     def take(self, timeout_s: float) -> Picture | None:
         """Take an image that has just arrived, otherwise the next one. Returns None if none arrives in `timeout_s`."""
         stored = self._slot.take()
-        if stored is not None and time.monotonic() - stored[0] <= _JUST_NOW_S:
+        if stored is not None and time.monotonic() - stored[0] <= JUST_NOW_S:
             return stored[1]
         fresh = self._slot.take(timeout_s)
         return fresh[1] if fresh else None
