@@ -53,6 +53,7 @@ def measure_light_robot(seconds: float) -> LightRobot:
     with tempfile.TemporaryDirectory(prefix="sightline-light-") as name, ExitStack() as ending:
         folder = Path(name)
         python = _bare_environment(folder / "venv")
+        os.sync()  # otherwise the disk is still writing the packages while the robot drives
         sockets = str(folder / "sockets")
         sim = ["sim", "--scenario", "circle", "--socket-dir", sockets]
         ending.enter_context(_service(sys.executable, sim, folder, "simulation ready"))
@@ -61,7 +62,9 @@ def measure_light_robot(seconds: float) -> LightRobot:
                            "--set", "safety.auto_arm=true"]
         robot = ending.enter_context(_service(python, robot_arguments, folder, "robot r1: on"))
         link = ending.enter_context(open_zenoh("r1", connect=[ENDPOINT], role="operator"))
-        ending.enter_context(_service(sys.executable, ["vision", "--connect", ENDPOINT], folder, "target seen"))
+        # `hsv`, because the default detector may need most of a slow machine. Then the robot would wait for answers.
+        vision = ["vision", "--connect", ENDPOINT, "--detector", "hsv"]
+        ending.enter_context(_service(sys.executable, vision, folder, "target seen"))
         fps, driving = _watch(link.latest(STATUS), seconds)
         driver = driver_of(robot.pid)
         network = children_of(driver)[-1]
