@@ -45,7 +45,7 @@ from sightline.robot_side.driver.supervision import (
     limit_core_dump,
     request_real_time,
 )
-from sightline.robot_side.guardian.core import AT_REST, ENDING, FAILED, IDLE, LOST, MOVING, REJECTS_US
+from sightline.robot_side.guardian.core import AT_REST, ENDING, FAILED, LOST, MOVING, REJECTS_US, STARTING
 from sightline.robot_side.guardian.start import GuardianEnd, zero_of
 from sightline.robot_side.guardian.stop_core import DriverReport, pack_report, unpack_ignored, unpack_number
 from sightline.robot_side.pipe import DriverEnd
@@ -391,7 +391,7 @@ class Driver:
         guardian = self._guardian if self._is_at_rest else None
         may_wait = guardian is not None and self.driver_end.is_start_due(now_us)
         if guardian is not None and may_wait:
-            guardian.beat(IDLE)
+            guardian.beat(STARTING)
         self.driver_end.keep_alive(now_us, self._driver_core.gate.issued.last_seq("frame") + 1)
         if guardian is not None and may_wait:
             guardian.beat(AT_REST)

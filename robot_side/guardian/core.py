@@ -14,7 +14,9 @@ MOVING: Final = b"1"
 LOST: Final = b"l"
 """Heartbeat: the wheels turn and the drive rejects speeds, so only the guardian can stop them."""
 IDLE: Final = b"i"
-"""The wheels are at zero, and the next heartbeat may wait for an operator, or for the start of a child."""
+"""The wheels are at zero, and the next heartbeat may wait for an operator."""
+STARTING: Final = b"s"
+"""The wheels are at zero, and the next heartbeat waits for the start of a child."""
 WATCHED: Final = b"w"
 """Message of a guardian to a driver process that it watches from now on."""
 ENDING: Final = b"e"
@@ -33,7 +35,7 @@ REJECTS_US: Final = 100_000
 STARVED_US: Final = 500_000
 """Silence of a driver without a processor, after which moving wheels are stopped. They are at zero within 700 ms."""
 STARTS_WITHIN_US: Final = 30_000_000
-"""Longest time to the first heartbeat; a first start reads its packages from a slow card."""
+"""Longest time to the first heartbeat, because a start reads its packages from a slow card; also after STARTING."""
 ENDS_WITHIN_US: Final = 7_000_000
 """Longest end after a request: 2 s for the ramp, then latch, network process and battery, each within a second."""
 MAX_RESTARTS: Final = 5
@@ -42,6 +44,11 @@ RESTART_WINDOW_US: Final = 60_000_000
 _OUT_OF_CONTROL: Final = {
     LOST: "its drive took no speeds for 100 ms",
     FAILED: "its drive did not take zero at the end",
+}
+_LIMITS: Final = {
+    b"": (STARTS_WITHIN_US, "did not start within 30 s"),
+    STARTING: (STARTS_WITHIN_US, "did not start its network process within 30 s"),
+    ENDING: (ENDS_WITHIN_US, "did not end within 7 s"),
 }
 _LONGEST_STEP_US: Final = PERIOD_US + LATE_US  # of one check; the rest is a delay of the guardian
 
@@ -78,12 +85,17 @@ class HeartbeatMonitor:
     @property
     def is_running(self) -> bool:
         """Return True if the loop has not announced its end. The end of such a process is an error."""
-        return self._last in (AT_REST, MOVING, LOST)
+        return self._last in (AT_REST, MOVING, LOST, STARTING)
+
+    @property
+    def is_starting(self) -> bool:
+        """Return True while the loop waits for the start of a child."""
+        return self._last == STARTING
 
     @property
     def is_late(self) -> bool:
         """Return True if a heartbeat is missing, so `look` needs the processor time of the driver."""
-        return self._silence_us >= LATE_US and self._last not in (b"", IDLE)
+        return self._silence_us >= LATE_US and self._last not in (b"", IDLE, STARTING)
 
     def on_beat(self, kind: bytes, sent_us: int) -> None:
         """Note a heartbeat. After ENDING, later heartbeats change nothing."""
@@ -109,10 +121,9 @@ class HeartbeatMonitor:
     def _reason(self) -> str:
         if self._last == IDLE:
             return ""
-        if not self._last:
-            return "did not start within 30 s" if self._silence_us >= STARTS_WITHIN_US else ""
-        if self._last == ENDING:
-            return "did not end within 7 s" if self._silence_us >= ENDS_WITHIN_US else ""
+        if self._last in _LIMITS:
+            limit_us, reason = _LIMITS[self._last]
+            return reason if self._silence_us >= limit_us else ""
         if self._own_us >= HUNG_US:
             return f"no heartbeat for {self._silence_us // 1000} ms"
         if self._last == MOVING and self._silence_us >= STARVED_US:

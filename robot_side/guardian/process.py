@@ -167,6 +167,8 @@ class Guardian:
                 os.kill(self._driver_pid, signal.SIGKILL)
                 with without_real_time():
                     return os.waitpid(self._driver_pid, 0)[1]
+            if self._monitor.is_starting:  # no heartbeat comes, and this process ends a start that hangs
+                self._feed(now_us)
             if not is_open:
                 time.sleep(0.001)
             self._keep_receiver()
@@ -203,7 +205,11 @@ class Guardian:
         self._monitor.on_beat(kind, sent_us)
         if kind == ENDING:
             self._systemd.notify("STOPPING=1")
-        elif now_us - self._fed_us >= _WATCHDOG_PERIOD_US:
+        else:
+            self._feed(now_us)
+
+    def _feed(self, now_us: int) -> None:
+        if now_us - self._fed_us >= _WATCHDOG_PERIOD_US:
             self._fed_us = now_us
             self._systemd.notify("READY=1\nWATCHDOG=1")
 

@@ -25,9 +25,9 @@ from sightline.robot_side.guardian.core import (
     AT_REST,
     ENDING,
     FAILED,
-    IDLE,
     LOST,
     MOVING,
+    STARTING,
     WATCHED,
     needs_zero,
     unpack_beat,
@@ -285,7 +285,7 @@ def test_last_heartbeat_permits_a_long_end_only_after_zero(run_with, loop, beat)
 
 
 @pytest.mark.parametrize(("at_rest", "runs", "beats"), [
-    (True, False, [AT_REST, IDLE, "start", AT_REST]), (True, True, [AT_REST]), (False, False, [MOVING, "start"]),
+    (True, False, [AT_REST, STARTING, "start", AT_REST]), (True, True, [AT_REST]), (False, False, [MOVING, "start"]),
 ])
 def test_start_of_the_network_process_may_wait_for_a_processor_only_at_rest(driver, monkeypatch, at_rest, runs, beats):
     done = []

@@ -5,6 +5,8 @@ import inspect
 import os
 import signal
 import socket
+import time
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -72,6 +74,37 @@ def test_the_guardian_feeds_the_watchdog_only_while_heartbeats_arrive(tmp_path, 
             robot.process.terminate()
             assert until(lambda: b"STOPPING=1" in manager.recv(256))
             assert robot.process.wait(5) == 0
+
+
+SLOW_START = """
+import subprocess, time
+from sightline.robot_side.hardware.log_drive import LogDrive
+class SlowPopen(subprocess.Popen):
+    def __init__(self, *arguments, **options):
+        time.sleep(1)
+        super().__init__(*arguments, **options)
+subprocess.Popen = SlowPopen
+class SlowStartDrive(LogDrive):
+    pass
+"""
+
+
+def test_the_watchdog_is_fed_while_a_busy_machine_starts_the_network_process(tmp_path, monkeypatch):
+    """The guardian limits that time. Without it systemd would end a healthy robot after a second."""
+    (tmp_path / "slow_start.py").write_text(SLOW_START)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    address = str(tmp_path / "notify")
+    drive = {"kind": "slow_start:SlowStartDrive", "options": {"path": str(tmp_path / "drive.csv")}}
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(address)
+        manager.settimeout(START_S)
+        monkeypatch.setenv("NOTIFY_SOCKET", address)
+        with RobotProcess(tmp_path, drive=drive) as robot:
+            fed_s = []
+            while "robot r1: on" not in robot.output():
+                assert manager.recv(256) == b"READY=1\nWATCHDOG=1"
+                fed_s.append(time.monotonic())
+            assert max(after - before for before, after in pairwise(fed_s)) < 0.6, robot.output()
 
 
 def test_supervision_without_a_manager_sends_nothing(monkeypatch):

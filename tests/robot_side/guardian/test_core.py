@@ -16,6 +16,7 @@ from sightline.robot_side.guardian.core import (
     PERIOD_US,
     REJECTS_US,
     RESTART_WINDOW_US,
+    STARTING,
     STARTS_WITHIN_US,
     STARVED_US,
     WATCHED,
@@ -119,7 +120,8 @@ def test_driver_that_falls_asleep_while_it_waits_for_a_processor_is_hung():
 
 
 def test_heartbeats_are_bytes_that_differ():
-    assert (AT_REST, MOVING, LOST, IDLE, ENDING, FAILED, WATCHED) == (b"0", b"1", b"l", b"i", b"e", b"f", b"w")
+    assert (AT_REST, MOVING, LOST, IDLE) == (b"0", b"1", b"l", b"i")
+    assert (STARTING, ENDING, FAILED, WATCHED) == (b"s", b"e", b"f", b"w")
     assert RESTART_WINDOW_US == 60_000_000
     assert pack_beat(MOVING, 1) == b"1\x01" + bytes(7)
     assert unpack_beat(pack_beat(MOVING, 2**40 + 3)) == (MOVING, 2**40 + 3)
@@ -135,6 +137,21 @@ def test_silence_counts_from_the_time_at_which_the_heartbeat_was_sent():
 def test_tool_that_waits_for_an_operator_may_be_silent():
     assert silence_us(beaten(IDLE), 0, limit_us=10 * STARTS_WITHIN_US)[0] is None
     assert beaten(IDLE).look(2_000_000) == ""
+
+
+@pytest.mark.parametrize("run_share", [None, 0.0, 1.0])
+def test_driver_that_hangs_in_the_start_of_its_network_process_is_killed_after_30_s(run_share):
+    monitor = beaten(STARTING, 0)
+    reason = "did not start its network process within 30 s"
+    assert silence_us(monitor, 0, run_share=run_share) == (STARTS_WITHIN_US, reason)
+    monitor.on_beat(AT_REST, 40_000_000)
+    assert not monitor.is_starting and silence_us(monitor, 40_000_000)[0] == HUNG_US
+
+
+def test_time_in_which_the_guardian_did_not_run_does_not_count_for_a_start():
+    monitor = beaten(STARTING, 0)
+    assert monitor.look(10 * STARTS_WITHIN_US) == "" and monitor.is_starting and not monitor.is_late
+    assert silence_us(monitor, 10 * STARTS_WITHIN_US)[0] == STARTS_WITHIN_US - PERIOD_US - LATE_US
 
 
 def test_processor_time_is_needed_only_after_a_missing_heartbeat():
@@ -179,7 +196,7 @@ def test_motors_are_set_to_zero_unless_the_driver_did_it(code, was_ready, expect
 
 
 @pytest.mark.parametrize(("kind", "is_running"), [
-    (AT_REST, True), (MOVING, True), (LOST, True), (IDLE, False), (ENDING, False), (FAILED, False),
+    (AT_REST, True), (MOVING, True), (LOST, True), (STARTING, True), (IDLE, False), (ENDING, False), (FAILED, False),
 ])
 def test_loop_runs_until_it_announces_its_end(kind, is_running):
     assert beaten(kind).is_running is is_running and not HeartbeatMonitor(0).is_running
