@@ -255,6 +255,7 @@ _DRAIN_US = 500_000  # to read the packets of a dead process; a descendant may k
 _FIRST_BACKOFF_US = 700_000  # the wheels are at zero before a peer can drive again
 _LONGEST_BACKOFF_US = 2_000_000
 _WEDGED_US = 2_000_000
+_LONGEST_STEP_US = 40_000  # of the loop between two calls; the rest is a delay of this process
 _STARTS_WITHIN_US = 30_000_000  # a first start reads its packages from a slow card
 _END_S = 1.0
 _FIRST_PATIENCE_US, _LONGEST_PATIENCE_US = 2_000_000, 60_000_000
@@ -287,7 +288,8 @@ class DriverEnd:
 
     def __init__(self, config: RobotConfig, session: str) -> None:
         self._received = False
-        self._received_us = 0
+        self._silent_us = self._kept_us = 0
+        self._hung = False
         self._config = config
         self._session = session
         self._process: subprocess.Popen[bytes] | None = None
@@ -309,12 +311,15 @@ class DriverEnd:
         """Start the network process if it is not running and the backoff is over."""
         if self._process is not None and self._process.poll() is not None and self._is_read(now_us):
             self._on_exit(self._process.returncode, now_us)
-        if self._received:
-            self._received, self._received_us = False, now_us
-        if self._process is not None and self._was_ready and now_us - self._received_us > _WEDGED_US:
-            self._process.kill()  # stopped or hung: a running process reports five times a second
+        # Limited steps, so that a time in which this process did not run does not count.
+        step_us, self._kept_us = min(now_us - self._kept_us, _LONGEST_STEP_US), now_us
+        self._silent_us = 0 if self._received else self._silent_us + step_us
+        self._received = False
+        if self._process is not None and self._was_ready and self._silent_us > _WEDGED_US:
+            self._hung = True  # or stopped: a running process reports five times a second
+            self._process.kill()
         if self.is_start_due(now_us):
-            self._received_us = now_us + _STARTS_WITHIN_US
+            self._silent_us, self._hung = -_STARTS_WITHIN_US, False
             try:
                 self._start(first_seq)
             except OSError as error:
@@ -359,7 +364,8 @@ class DriverEnd:
             return
         if code == CAMERA_EXIT:  # later each time, because a restart also interrupts the link
             self._camera_patience_us = min(2 * self._camera_patience_us, _LONGEST_PATIENCE_US)
-        _log.info("network process ended (%s); starting it again", "camera" if code == CAMERA_EXIT else code)
+        why = "silent for 2 s" if self._hung else "camera" if code == CAMERA_EXIT else code
+        _log.info("network process ended (%s); starting it again", why)
         self._start_at_us = now_us + self._backoff_us
         self._backoff_us = min(2 * self._backoff_us, _LONGEST_BACKOFF_US)
 

@@ -165,6 +165,63 @@ def test_dead_process_with_a_descendant_on_the_socket_is_restarted(child):
     theirs.close()
 
 
+def silence_us(child, begin_us, step_us):
+    """Keep a silent process alive every `step_us` from `begin_us` on, and return its silence when it was killed."""
+    for now_us in range(begin_us + step_us, begin_us + 60_000_000, step_us):
+        child.keep_alive(now_us, 0)
+        if child._process.killed:
+            return now_us - begin_us
+    return None
+
+
+@pytest.fixture
+def silent(child, monkeypatch):
+    """A child whose process is ready, and sends nothing after time 0."""
+    monkeypatch.setattr(child, "_start", lambda _first_seq: None)
+    child.keep_alive(0, 0)
+    child._process = FakeProcess()
+    child.on_ready()
+    child._received = True
+    child.keep_alive(0, 0)
+    return child
+
+
+class FakeProcess:
+    """A process that runs until it is killed."""
+
+    killed, returncode = False, None
+
+    def poll(self):
+        return self.returncode
+
+    def kill(self):
+        self.killed, self.returncode = True, -9
+
+    def wait(self):
+        pass
+
+
+@pytest.mark.parametrize("step_us", [2_000, 20_000, 40_000])
+def test_silent_network_process_is_killed_after_2_s(silent, step_us, caplog):
+    caplog.set_level("INFO", "sightline")
+    assert silence_us(silent, 0, step_us) == 2_000_000 + step_us
+    for now_us in (3_000_000, 4_000_000):
+        silent.keep_alive(now_us, 0)
+    assert caplog.messages == ["network process ended (silent for 2 s); starting it again"]
+
+
+@pytest.mark.parametrize("pause_us", [2_500_000, 60_000_000])
+def test_time_in_which_the_driver_process_did_not_run_does_not_count_as_silence(silent, pause_us):
+    """A busy machine stops both, and the driver process may run first afterward."""
+    for now_us in range(0, 1_900_000, 20_000):
+        silent.keep_alive(now_us, 0)
+    silent.keep_alive(1_900_000 + pause_us, 0)
+    assert not silent._process.killed
+    silent._received = True
+    silent.keep_alive(2_000_000 + pause_us, 0)
+    assert silence_us(silent, 2_000_000 + pause_us, 100_000) == 5_100_000, "40 ms of each 100 ms count"
+
+
 # --- whole -------------------------------------------------------------------------------------------------------
 
 
