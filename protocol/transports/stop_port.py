@@ -214,6 +214,10 @@ def read_secret(file: str) -> bytes:
 
 
 _RESTART_US: Final = 1_000_000
+_UNREAD_BYTES: Final = 240
+"""Two seconds of reports of a robot at rest. A running process reads each one immediately, also in a flood."""
+_MAX_BEHIND: Final = 5
+"""Checks, a second after each other, that find so many unread bytes in the pipe of a stopped or hung process."""
 _CHILD: Final = (
     "import sys; top = type(sys)('sightline'); top.__path__ = [sys.argv.pop(1)]; sys.modules['sightline'] = top; "
     "from sightline.{} import main; main()"
@@ -240,20 +244,27 @@ class StopProcess:
         self.module, self.options = module, options
         self._process: Any = None
         self._start_at_us = 0
+        self._behind = 0
 
     def keep_alive(self, at_us: int) -> None:
-        """Start the process if it does not run, at most once a second."""
+        """Start the process if it does not run, at most once a second. A stopped or hung one is killed first."""
         if at_us < self._start_at_us:
             return
         self._start_at_us = at_us + _RESTART_US
-        if self._process is None or self._process.poll() is not None:
+        if self._process is not None and self._process.poll() is None:
+            self._behind = self._behind + 1 if self._unread_bytes() >= _UNREAD_BYTES else 0
+            if self._behind == _MAX_BEHIND:
+                self._process.kill()
+        else:
             # Imported here, because the STOP process itself should not load them.
             import logging
             import subprocess
 
             if self._process is not None:
                 logging.getLogger(__name__).error(
-                    "STOP %s ended (%d); starting it again", self.module.rpartition("_")[2], self._process.poll())
+                    "STOP %s ended (%s); starting it again", self.module.rpartition("_")[2],
+                    "stopped or hung" if self._behind >= _MAX_BEHIND else self._process.poll())
+            self._behind = 0
             root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))  # noqa: PTH100, PTH120
             number = self.far.fileno()
             command = [sys.executable, "-I", "-S", "-c", _CHILD.format(self.module), root, str(number)]
@@ -263,6 +274,13 @@ class StopProcess:
             with suppress(OSError):  # no process or descriptor is free now; the next call tries again
                 self._process = subprocess.Popen(command, pass_fds=[number], stdin=subprocess.DEVNULL)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+    def _unread_bytes(self) -> int:
+        """Return the size of the packets that the process has not read."""
+        import fcntl
+        import termios
+
+        return int.from_bytes(fcntl.ioctl(self.far, termios.FIONREAD, bytes(4)), sys.byteorder)
 
     @property
     def pid(self) -> int:

@@ -183,6 +183,49 @@ def test_a_killed_receiver_is_logged_and_started_again(started, operator, caplog
     assert caplog.messages == ["STOP receiver ended (-9); starting it again"]
 
 
+def report_for(process, seconds, *, begin_us):
+    """Let a robot at rest send its reports for `seconds`, while its guardian looks after the process."""
+    for tenth in range(10 * seconds):
+        send_packet(process.near, pack_report(DriverReport(0, "DISARMED", True, True)))
+        process.keep_alive(begin_us + 100_000 * tenth)
+
+
+def test_stopped_receiver_is_logged_and_started_again(started, operator, caplog):
+    address = ("127.0.0.1", free_port())
+    process = started(stop_receiver.start("r1", [address], [], ""))
+    driver, begin_us = Driver(process), now_us() + 1_000_000
+    assert stop(operator, address, driver, StopRequests("r1", b"", 7))
+    stopped = process._process
+    stopped.send_signal(signal.SIGSTOP)
+    report_for(process, 6, begin_us=begin_us)
+    assert stopped.poll() is None and not caplog.messages, "the machine may be busy"
+    report_for(process, 2, begin_us=begin_us + 6_000_000)
+    assert stopped.wait(START_S) == -signal.SIGKILL
+    report_for(process, 2, begin_us=begin_us + 8_000_000)
+    assert caplog.messages == ["STOP receiver ended (stopped or hung); starting it again"]
+    assert stop(operator, address, driver, StopRequests("r1", b"", 70))
+    process._process.kill()
+    process._process.wait()
+    process.keep_alive(begin_us + 20_000_000)
+    assert caplog.messages[1:] == ["STOP receiver ended (-9); starting it again"]
+
+
+@pytest.mark.parametrize("behind_s", [1, 3, 4])
+def test_receiver_that_is_late_but_reads_is_left_alone(started, operator, caplog, behind_s):
+    address = ("127.0.0.1", free_port())
+    process = started(stop_receiver.start("r1", [address], [], ""))
+    driver, begin_us = Driver(process), now_us() + 1_000_000
+    assert stop(operator, address, driver, StopRequests("r1", b"", 7))
+    running = process._process
+    for turn in range(3):
+        running.send_signal(signal.SIGSTOP)
+        report_for(process, 2 + behind_s, begin_us=begin_us + 10_000_000 * turn)
+        running.send_signal(signal.SIGCONT)
+        assert until(lambda: process._unread_bytes() == 0, START_S)
+        process.keep_alive(begin_us + 10_000_000 * turn + 9_000_000)
+    assert process._process is running and running.poll() is None and not caplog.messages
+
+
 def test_killed_forwarder_is_logged_by_its_own_name(started, caplog):
     process = started(stop_forwarder.start([], ""))
     process._process.kill()
