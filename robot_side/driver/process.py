@@ -267,7 +267,7 @@ class Driver:
         # The last process may have been disarmed, or have lost a human. Then only an operator may arm again.
         self._driver_core.gate.arms_itself &= guardian is None or not guardian.is_restart
         self._logged_state = self._driver_core.gate.state
-        self._is_waiting_logged = False
+        self._is_waiting_logged = self._is_ending_logged = False
         self._ending_since_us: int | None = None
         self._guardian = guardian
         self._commanded_us = 0
@@ -342,7 +342,15 @@ class Driver:
         if self._ending_since_us is None:
             return False
         self._driver_core.gate.disarm("shutting down")
+        self._log_ending()
         return self._is_at_rest or monotonic_us() - self._ending_since_us > _SHUTDOWN_US
+
+    def _log_ending(self) -> None:
+        """Log once that the robot ends. A network process that failed at its start has printed the reason."""
+        if not self._is_ending_logged and not self.driver_end.failed_at_start:
+            self._is_ending_logged = self._is_waiting_logged = True
+            self._logged_state = self._driver_core.gate.state
+            self._log(f"{self._logged_state} (shutting down)")
 
     @property
     def _is_at_rest(self) -> bool:

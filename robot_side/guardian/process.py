@@ -130,11 +130,19 @@ class Guardian:
             self._log_line(f"the driver process was ended by signal {-code}")
         elif self._monitor.is_running:
             self._log_line(f"the driver process ended by itself with code {code}; did a plug-in end it?")
+        elif self._ended_at_start(code):
+            self._log_line(f"the driver process ended before its first tick (code {code}), so the robot ends; see the "
+                           "line above, or look for a plug-in that ends its process")
         if (error := self._zero_failed) is not None:
             _log.error("robot %s: motors NOT set to zero: %s: %s; switch off their supply",
                        self._setup["robot"], type(error).__name__, error, exc_info=error)
         elif was_zeroed:
             self._log_line("the motors are set to zero")
+
+    def _ended_at_start(self, code: int) -> bool:
+        """Return True for an end that no line explains. An error of the first start is printed by its command."""
+        may_start = self._setup["driver"] is not None and self._end_signal is None
+        return may_start and not self._monitor.is_ready and (code == 0 or self._fed_us > 0)
 
     def _needs_zero(self, code: int) -> bool:
         """Return True if the wheels may turn, also since an earlier process. An end with code 0 has stopped them."""

@@ -10,6 +10,8 @@ import pytest
 
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver import process
+from sightline.robot_side.driver.core import DriverCore
+from sightline.robot_side.driver.persistence import StopLatch
 from sightline.robot_side.driver.process import Driver
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
 from sightline.robot_side.safety.limits import MIN_TICK_US, TICK_US
@@ -112,6 +114,33 @@ def test_robot_that_slept_for_an_hour_is_not_late(run):
     loop.select = sleep_once
     assert len(run(loop, seconds=0.4)) == 21
     assert loop.core.tick_late_max_us == 3_000
+
+
+@pytest.mark.parametrize(("is_stopped", "lines"), [
+    (False, ["robot r1: DISARMED (shutting down)"]), (True, ["robot r1: STOPPED (shutting down)"]),
+])
+def test_end_of_a_robot_at_rest_is_one_line(run, tmp_path, caplog, is_stopped, lines):
+    caplog.set_level("INFO", "sightline")
+    if is_stopped:
+        StopLatch(tmp_path, "r1").write(stopped=True)
+    run(VirtualLoop(late_us=0), seconds=0.1)
+    assert caplog.messages == lines
+
+
+def test_end_of_a_robot_in_motion_is_one_line_too(run, monkeypatch, caplog):
+    caplog.set_level("INFO", "sightline")
+    loop = VirtualLoop(late_us=0)
+    monkeypatch.setattr(DriverCore, "at_rest", property(lambda _core: len(loop.ticks_us) > 9))
+    assert run(loop, seconds=0.1)[-1] == 180_000, "it ramps to zero"
+    assert caplog.messages == ["robot r1: DISARMED (shutting down)"]
+
+
+def test_robot_whose_network_process_failed_at_its_start_adds_no_line(run, caplog):
+    caplog.set_level("INFO", "sightline")
+    loop = VirtualLoop(late_us=0)
+    loop.failed_at_start = True
+    run(loop, seconds=0.1)
+    assert caplog.messages == []
 
 
 def commanded(loop, gaps_us):

@@ -234,6 +234,34 @@ def test_end_before_the_first_heartbeat_is_quick_and_quiet(tmp_path, number):
         assert "Traceback" not in robot.output()
 
 
+LEAVING = """
+import os
+from pathlib import Path
+from sightline.robot_side.hardware.log_drive import LogDrive
+class LeavingDrive(LogDrive):
+    def __init__(self, config):
+        if (code := Path(config.path).with_suffix(".code")).exists():
+            os._exit(int(code.read_text()))
+        super().__init__(config)
+"""
+
+
+@pytest.mark.parametrize(("at_restart", "code"), [(False, 0), (True, 0), (True, 3)])
+def test_plugin_that_ends_a_driver_process_during_its_start_is_one_line(tmp_path, monkeypatch, at_restart, code):
+    (tmp_path / "leaving.py").write_text(LEAVING)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    options = {"path": str(tmp_path / "drive.csv")}
+    if not at_restart:
+        (tmp_path / "drive.code").write_text(str(code))
+    with RobotProcess(tmp_path, drive={"kind": "leaving:LeavingDrive", "options": options}) as robot:
+        if at_restart:
+            robot.wait_until_on()
+            (tmp_path / "drive.code").write_text(str(code))
+            os.kill(robot.driver_pid(), signal.SIGKILL)
+        assert robot.process.wait(START_S) == code
+        assert f"the driver process ended before its first tick (code {code}), so" in robot.output().splitlines()[-1]
+
+
 def test_drive_without_zero_is_one_line_at_start(tmp_path):
     kind = "tests.fixtures.dying:ZerolessDrive"
     with RobotProcess(tmp_path, drive={"kind": kind}) as robot:
