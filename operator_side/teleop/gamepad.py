@@ -38,6 +38,7 @@ _BUTTONS: Final = {BTN_EAST: PadKey.STOP, BTN_SOUTH: PadKey.HAND_OVER}
 class Pad:
     """Left stick: forward and back. Either stick sideways: turning. Hold a shoulder button to drive.
 
+    A stick that is pushed when the button is pressed drives only after both sticks were at their centers.
     `ranges` are the (least, most) values of each axis, from the device.
     """
 
@@ -45,6 +46,8 @@ class Pad:
     _axes: dict[int, float] = field(default_factory=dict)
     _held: set[int] = field(default_factory=set)
     _stopped: bool = False
+    _was_centered: bool = False
+    """True if the sticks were at their centers since a shoulder button was pressed."""
 
     def on_event(self, kind: int, code: int, value: int) -> PadKey | None:
         """Process one event. Returns a button with an action. After STOP, a shoulder button must be pressed again."""
@@ -52,7 +55,6 @@ class Pad:
             self._axes[code] = self._share(code, value)
         elif (kind, code) == (EV_SYN, SYN_DROPPED):
             self._held.clear()
-            self._axes.clear()
             self._stopped = False
         elif kind == EV_KEY and code in _DEAD_MAN:
             (self._held.add if value else self._held.discard)(code)
@@ -60,6 +62,7 @@ class Pad:
         elif kind == EV_KEY and value == 1 and code in _BUTTONS:
             self._stopped = bool(self._held)
             return _BUTTONS[code]
+        self._was_centered = bool(self._held) and (self._was_centered or self._position == (0.0, 0.0))
         return None
 
     @property
@@ -67,6 +70,10 @@ class Pad:
         """Return (linear, angular) shares, -1..1, or None while no shoulder button is held. Stick left turns left."""
         if not self._held or self._stopped:
             return None
+        return self._position if self._was_centered else (0.0, 0.0)
+
+    @property
+    def _position(self) -> tuple[float, float]:
         sideways = [self._axes.get(code, 0.0) for code in (ABS_X, ABS_RX)]
         return -self._axes.get(ABS_Y, 0.0), -max(sideways, key=abs)
 
@@ -98,6 +105,10 @@ class Gamepad:
         self.name: str = self._device.name
         known = (ABS_X, ABS_Y, ABS_RX)
         self.pad = Pad({code: (info.min, info.max) for code, info in axes.items() if code in known})
+        # The device reports changes only. ABS_RX is a trigger of some gamepads, which is never at a center.
+        for code in (ABS_X, ABS_Y):
+            if code in axes:
+                self.pad.on_event(EV_ABS, code, axes[code].value)
 
     def fileno(self) -> int:
         """Return the descriptor, for `select`."""

@@ -7,11 +7,13 @@ from types import SimpleNamespace
 import pytest
 
 from sightline.operator_side.teleop.gamepad import (
+    ABS_RX,
     ABS_X,
     ABS_Y,
     BTN_EAST,
     BTN_SOUTH,
     BTN_TL,
+    BTN_TR,
     EV_ABS,
     EV_KEY,
     EV_SYN,
@@ -26,10 +28,10 @@ from sightline.protocol.errors import ConfigError, HardwareError
 class Device:
     """The used part of `evdev.InputDevice`; it gives `events` once, then it is gone."""
 
-    def __init__(self, path, keys=(BTN_SOUTH, BTN_TL), axes=(ABS_X, ABS_Y)):
+    def __init__(self, path, keys=(BTN_SOUTH, BTN_TL), axes=(ABS_X, ABS_Y), value=128):
         self.path, self.name, self.fd = path, f"pad {path}", 7
         self.closed, self.events = False, []
-        self._keys, self._axes = list(keys), [(code, SimpleNamespace(min=0, max=255)) for code in axes]
+        self._keys, self._axes = list(keys), [(code, SimpleNamespace(min=0, max=255, value=value)) for code in axes]
 
     def capabilities(self, absinfo=False):
         return {EV_KEY: self._keys, EV_ABS: self._axes if absinfo else [code for code, _ in self._axes]}
@@ -108,7 +110,58 @@ def test_after_events_were_lost_nothing_counts_as_held():
     pad.on_event(EV_ABS, ABS_Y, 0)
     assert pad.shares == (1.0, 0.0)
     pad.on_event(EV_SYN, SYN_DROPPED, 0)
+    assert pad.shares is None
     pad.on_event(EV_ABS, ABS_Y, 10)
     assert pad.shares is None
     pad.on_event(EV_KEY, BTN_TL, 1)
     assert pad.shares is not None
+
+
+PUSHED = [(ABS_Y, 0), (ABS_Y, 255), (ABS_X, 0), (ABS_RX, 255), (ABS_RX, 150)]
+
+
+@pytest.mark.parametrize("axis", PUSHED)
+@pytest.mark.parametrize("before", [
+    [], [(EV_KEY, BTN_TL, 1), (EV_KEY, BTN_TL, 0)], [(EV_KEY, BTN_TL, 1), (EV_KEY, BTN_EAST, 1), (EV_KEY, BTN_TL, 0)],
+    [(EV_KEY, BTN_TL, 1), (EV_SYN, SYN_DROPPED, 0)],
+], ids=["first", "again", "after stop", "after lost events"])
+def test_stick_that_is_pushed_when_the_button_is_pressed_drives_only_after_it_was_centered(axis, before):
+    pad = Pad(dict.fromkeys((ABS_X, ABS_Y, ABS_RX), (0, 255)))
+    code, value = axis
+    for event in (*before, (EV_ABS, code, value), (EV_KEY, BTN_TL, 1)):
+        pad.on_event(*event)
+    assert pad.shares == (0.0, 0.0)
+    pad.on_event(EV_ABS, code, value + (1 if value < 128 else -1))  # it jitters
+    pad.on_event(EV_KEY, BTN_TR, 1)
+    assert pad.shares == (0.0, 0.0)
+    pad.on_event(EV_ABS, code, 128)
+    pad.on_event(EV_ABS, code, value)
+    assert pad.shares is not None and any(pad.shares)
+    pad.on_event(EV_KEY, BTN_TL, 0)
+    assert any(pad.shares), "the other shoulder button is still held"
+
+
+def test_other_stick_that_is_pushed_waits_too():
+    pad = Pad(dict.fromkeys((ABS_X, ABS_Y, ABS_RX), (0, 255)))
+    for event in ((EV_ABS, ABS_RX, 255), (EV_KEY, BTN_TL, 1), (EV_ABS, ABS_Y, 0)):
+        pad.on_event(*event)
+    assert pad.shares == (0.0, 0.0)
+    pad.on_event(EV_ABS, ABS_RX, 128)
+    assert pad.shares == (0.0, 0.0), "the first stick is pushed meanwhile"
+    pad.on_event(EV_ABS, ABS_Y, 128)
+    pad.on_event(EV_ABS, ABS_Y, 0)
+    assert pad.shares == (1.0, 0.0)
+
+
+def test_stick_that_was_pushed_before_teleop_started_drives_only_after_it_was_centered(plugged):
+    plugged["a"] = device = Device("a", value=0)
+    gamepad = Gamepad("a")
+    device.events = [(EV_KEY, BTN_TL, 1), (EV_ABS, ABS_Y, 3)]
+    gamepad.read()
+    assert gamepad.pad.shares == (0.0, 0.0)
+    plugged["b"] = device = Device("b", axes=(ABS_X, ABS_Y, ABS_RX))
+    device._axes[2][1].value = 0  # a trigger at rest
+    gamepad = Gamepad("b")
+    device.events = [(EV_KEY, BTN_TL, 1), (EV_ABS, ABS_Y, 0)]
+    gamepad.read()
+    assert gamepad.pad.shares == (1.0, 0.0)
