@@ -27,7 +27,7 @@ from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.preflight import needs
 from sightline.operator_side.table import print_table
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.log import start_log
+from sightline.protocol.log import error_text, start_log
 from sightline.protocol.transports.tokens import LEAST_WEIGHT, MOST_WEIGHT
 
 if TYPE_CHECKING:
@@ -192,6 +192,8 @@ def _problem(registry: "PluginRegistry", name: str) -> str:
             return missing()
     except ConfigError as error:
         return str(error)
+    except BaseException as error:  # any, because the caller waits for it
+        return f"its import or missing() raises {type(error).__name__}: {error_text(error)}; fix the plug-in"
 
 
 def check(

@@ -57,6 +57,22 @@ def test_detector_list_names_a_plug_in_that_fails(capsys, monkeypatch) -> None:
     assert code == 0 and why["hsv"].startswith("hsv's missing() raises ZeroDivisionError") and why["onnx"] == ""
 
 
+@pytest.mark.parametrize(("error", "why"), [
+    (KeyboardInterrupt(), "KeyboardInterrupt: KeyboardInterrupt"), (GeneratorExit("odd"), "GeneratorExit: odd"),
+    (type("Gone", (BaseException,), {})("two\nlines"), "Gone: two lines"),
+])  # fmt: skip
+def test_detector_list_shows_at_once_an_error_that_ends_a_thread(capsys, monkeypatch, error, why: str) -> None:
+    def fail() -> str:
+        raise error
+
+    monkeypatch.setattr(Hsv, "missing", fail, raising=False)
+    monkeypatch.setattr(cli_detector, "_LISTED_S", 60.0)
+    code, out, err = run(capsys, "detector", "list", "--json")
+    listed = {one["name"]: one["why"] for one in json.loads(out)["detectors"]}
+    assert (code, err) == (0, "")
+    assert listed["hsv"] == f"its import or missing() raises {why}; fix the plug-in" and listed["onnx"] == ""
+
+
 def test_detector_list_recommends_in_five_lines_and_names_missing_packages(capsys, monkeypatch) -> None:
     for package in ("torch", "ultralytics", "transformers"):
         monkeypatch.setitem(sys.modules, package, None)
