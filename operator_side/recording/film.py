@@ -203,8 +203,8 @@ def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Cap
 def record(link: Link, pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Recorder:
     """Write the messages of `seconds`, or until Ctrl-C, SIGTERM or SIGHUP, to `path`. `wanted` may add the overlay.
 
-    A file that is there already stays until then. Raises LinkError if none arrives, ConfigError for a file that cannot
-    be written to its end, or that another recording writes.
+    A file that is there already stays until then. Raises LinkError if none arrives, ConfigError for a file that another
+    recording writes, or that cannot be written to its end. Its beginning is kept, next to a file that was there.
     """
     target = Path(os.path.realpath(path))
     beside = whole(target, MESSAGES) if target.is_file() else nullcontext(target)
@@ -219,8 +219,11 @@ def record(link: Link, pictures: Pictures, path: Path, wanted: Channel, seconds:
         if not (recorder.failed or recorder.counts):
             part.unlink()
             raise LinkError(_silence(pictures, wanted))
-    if recorder.failed:
-        raise ConfigError(f"recording {path} ends early: {recorder.failed}; free some space or name another file")
+        if recorder.failed:
+            is_beside = part != target
+            kept = part.rename(part.with_name(part.name.removeprefix("."))) if is_beside else path
+            raise ConfigError(f"recording {kept} ends early: {recorder.failed}; "
+                              + f"{path} is unchanged; " * is_beside + "free some space or name another file")
     return recorder
 
 

@@ -379,6 +379,25 @@ def test_recording_on_a_full_disk_ends_with_one_line() -> None:
         record(robot, robot, Path("/dev/full"), FRAME, 60.0)
 
 
+@pytest.mark.parametrize("name", ["run.mcap", "link.mcap", ".run.mcap"])
+def test_recording_on_a_full_disk_keeps_the_earlier_file_and_its_own_beginning(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    (tmp_path / "run.mcap").write_bytes(b"earlier")
+    if name == "link.mcap":
+        path.symlink_to(tmp_path / "run.mcap")
+    elif name == ".run.mcap":
+        path.write_bytes(b"earlier")
+    there = set(tmp_path.iterdir())
+    robot = Talking(*[[Message(FRAME, "", b"{}", os.urandom(200_000))]] * 30)
+    with full_disk(3_000_000), pytest.raises(ConfigError) as failed:
+        record(robot, robot, path, FRAME, 60.0)
+    (kept,) = set(tmp_path.iterdir()) - there
+    assert path.read_bytes() == b"earlier" and kept.suffix == ".mcap" and 5 <= len(list(read_recording(kept))) < 30
+    assert str(failed.value) == (f"recording {kept} ends early: No space left on device; {path} is unchanged; "
+                                 "free some space or name another file")
+    assert kept.name.startswith(".") is (name == ".run.mcap")
+
+
 @pytest.mark.parametrize("overlay", [False, True])
 @pytest.mark.parametrize("dropped", [0, 3])
 def test_capture_prints_what_it_recorded(monkeypatch, capsys, tmp_path: Path, overlay: bool, dropped: int) -> None:
