@@ -263,12 +263,14 @@ class OldRobot:
 
     def _handle(self, client) -> None:
         self.clients.append(client)
+        end = []
         try:
             for message in client:
                 self.said.append(message)
         except ConnectionClosed as closed:
-            self.said.append(f"closed {closed.rcvd.code if closed.rcvd else 0}")
-        self.clients.remove(client)
+            end = [f"closed {closed.rcvd.code if closed.rcvd else 0}"]
+        self.clients.remove(client)  # a test that reads the end sends to the next client
+        self.said += end
 
     def send(self, text: str | bytes) -> None:
         for client in list(self.clients):
