@@ -230,6 +230,26 @@ class SkipCounter:
         return is_new or self.count in _REPORTED_COUNTS
 
 
+class PhaseLimiter:
+    """Selects the changes of phase to log, because a mission may change its phase with each frame.
+
+    A phase that lasted for a long row of frames may change at once. Otherwise the change is logged after 1, 2, 4 ...
+    60 s, or when the new phase has lasted.
+    """
+
+    def __init__(self) -> None:
+        self._phase, self._row = "", _LONG_ROW
+        self._limiter = RepeatLimiter()
+
+    def is_due(self, phase: str, now_us: int) -> bool:
+        """Note the phase of a frame. Returns True if it may be logged."""
+        if phase == self._phase:
+            self._row += 1
+            return self._row >= _LONG_ROW
+        has_lasted, self._phase, self._row = self._row >= _LONG_ROW, phase, 1
+        return has_lasted or self._limiter.due("", now_us) > 0
+
+
 class DriverSession:
     """A session of a driver: the common data of its commands."""
 
@@ -277,7 +297,7 @@ class Service:
         self._arrived_us = self._busy_us = self._thread = 0
         self._queue_ages_us: deque[int] = deque(maxlen=_QUEUE_AGES)
         self.skipped: Counter[str] = Counter()
-        self._skipped_images = SkipCounter()
+        self._skipped_images, self._phases = SkipCounter(), PhaseLimiter()
         self._mission_channel = MissionChannel(config, link, self._detector, self._log_change, self._reject)
         self._viewing = ViewPublisher(config, link, self._log_change)
 
@@ -520,12 +540,11 @@ class Service:
                 self._log_change("phase", f"skipped images: {self._skipped_images.count}; newest: {seen.note}")
             return
         self._skipped_images.use()
-        if seen.phase in _REPORTED_PHASES:
-            self._log_change("phase", _REPORTED_PHASES[seen.phase])
-        elif seen.phase == "tracking" and seen.distance_m is not None:
-            self._log_change("phase", f"target seen at {seen.distance_m:.2f} m", "seen")
-        elif seen.phase != "coasting":
-            self._log_change("phase", ": ".join(filter(None, (seen.phase, seen.note))), seen.phase)
+        if seen.phase == "coasting":
+            return
+        line, state = _phase_line(seen)
+        if self._phases.is_due(state, self._now_us()):
+            self._log_change("phase", line, state)
 
     def _log_change(self, about: str, line: str, state: str = "", *, is_frequent: bool = False) -> None:
         """Log `line` if the state of its subject has changed.
@@ -539,6 +558,15 @@ class Service:
         if times:
             self._reported[about] = state or line
             self._report(f"vision: {line}" + (f" ({times} changes)" if times > 1 else ""))
+
+
+def _phase_line(seen: Observation) -> tuple[str, str]:
+    """Return the line that reports a phase, and its state, which a new distance or note does not change."""
+    if seen.phase in _REPORTED_PHASES:
+        return _REPORTED_PHASES[seen.phase], seen.phase
+    if seen.phase == "tracking" and seen.distance_m is not None:
+        return f"target seen at {seen.distance_m:.2f} m", "seen"
+    return ": ".join(filter(None, (seen.phase, seen.note))), seen.phase
 
 
 def _shown(session: str) -> str:

@@ -9,6 +9,7 @@ import time
 import cv2
 import numpy as np
 import pytest
+from pydantic import BaseModel
 
 from sightline.protocol.channels import ACK, CAMERA, FRAME, TWIST
 from sightline.protocol.codec import decode, encode
@@ -17,10 +18,11 @@ from sightline.protocol.proof import session_digest
 from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import LatestSlot, Message
 from sightline.protocol.transports.memory import MemoryNetwork
-from sightline.vision_side.config import DetectorConfig, VisionConfig
+from sightline.vision_side.config import DetectorConfig, MissionConfig, VisionConfig
+from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.serving import service as service_module
 from sightline.vision_side.serving.process import serve
-from sightline.vision_side.serving.service import Service, SkipCounter
+from sightline.vision_side.serving.service import PhaseLimiter, Service, SkipCounter
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.vision.vision import YELLOW_BGR, camera, jpeg_of, scene
 
@@ -34,14 +36,14 @@ COLOR = VisionConfig(detector=DetectorConfig(kind="hsv"))
 class Bench:
     """A robot's end of the link, and the service on the other."""
 
-    def __init__(self, *, is_standby: bool = False) -> None:
+    def __init__(self, *, is_standby: bool = False, config: VisionConfig = COLOR) -> None:
         self.network = MemoryNetwork(seed=1)
         self.robot = self.network.link("r1")
         self.twists: LatestSlot[Message] = self.robot.latest(TWIST)
         self.acks: LatestSlot[Message] = self.robot.latest(ACK)
         self.said: list[str] = []
         link = self.network.link("r1", role="vision")
-        self.service = Service(COLOR, link, self.said.append, is_standby=is_standby)
+        self.service = Service(config, link, self.said.append, is_standby=is_standby)
         self.now_us = 0
 
     def camera(self, model: CameraModel = MODEL) -> None:
@@ -284,6 +286,56 @@ def test_lines_are_logged_per_change_and_never_per_frame(bench: Bench) -> None:
         *(f"skipped images: {count}; newest: image: not a JPEG, no SOI marker"
           for count in (1, 10, 100)),
     ]
+
+
+class Restless:
+    """A mission whose phase changes after `each` frames, and whose note changes with each frame."""
+
+    class Config(BaseModel):
+        each: int = 1
+        phases: tuple[str, ...] = ("red", "green")
+
+    def __init__(self, config: Config, _camera: CameraModel) -> None:
+        self._config, self._frames = config, 0
+
+    def step(self, _view: View) -> Plan:
+        self._frames += 1
+        phase = self._config.phases[self._frames // self._config.each % len(self._config.phases)]
+        return Plan(Twist(linear_mps=0, angular_rad_s=0), phase, f"frame {self._frames}")
+
+
+@pytest.mark.parametrize(("each", "phases", "least", "most"), [
+    (1, ("red", "green"), 2, 5), (3, ("red", "green"), 2, 5), (1, tuple(map(str, range(200))), 2, 5),
+    (29, ("red", "green"), 3, 5), (45, ("red", "green"), 5, 5), (45, ("lost", "searching"), 5, 5),
+])  # fmt: skip
+def test_phase_that_changes_with_each_frame_is_limited_and_one_that_lasts_is_logged(each, phases, least, most) -> None:
+    mission = MissionConfig(kind=f"{__name__}:Restless", options={"each": each, "phases": phases})
+    bench = Bench(config=VisionConfig(detector=DetectorConfig(kind="hsv"), mission=mission))
+    bench.service._now_us = lambda: bench.now_us
+    small = camera(32, 24)
+    bench.camera(small)
+    jpeg = jpeg_of(np.full((24, 32, 3), 140, np.uint8))
+    for seq in range(1, 200):
+        bench.frame(jpeg, seq)
+    lines = [line for line in bench.said if not line.startswith(("vision: camera", "vision: frames"))]
+    assert least <= len(lines) <= most, lines
+
+
+@pytest.mark.parametrize("rest", [30, 31, 300])
+def test_phase_after_many_quick_changes_is_logged_when_it_has_lasted(rest: int) -> None:
+    limiter, now_us = PhaseLimiter(), 0
+    for number in range(100_000):
+        now_us += 33_333
+        limiter.is_due(str(number % 2), now_us)
+    logged = [limiter.is_due("last", now_us + at * 33_333) for at in range(rest)]
+    assert not any(logged[:29]) and all(logged[29:])
+    assert limiter.is_due("next", now_us + rest * 33_333)
+
+
+def test_phases_that_change_with_each_frame_for_an_hour_are_logged_once_a_minute() -> None:
+    limiter = PhaseLimiter()
+    logged = [at for at in range(108_000) if limiter.is_due(str(at), at * 33_333)]
+    assert logged[0] == 0 and 55 <= len(logged) <= 70
 
 
 def skip_lines(bench: Bench) -> list[str]:
