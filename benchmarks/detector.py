@@ -67,22 +67,25 @@ PACED_S: Final = 1 / 30
 HOT_S: Final = 0.0
 _WARM: Final = 30
 _DEADLINE_US: Final = 500_000
+_PRESENT_S: Final = 1.0
+"""Time from one status of a robot to the next."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Medians for one frame, us. `unanswered` counts frames without a valid remote answer."""
+    """Medians for one answered frame, us. `unanswered` counts frames without a valid answer."""
 
-    here_us: float
-    there_us: float
+    here_us: float | None
+    there_us: float | None
+    """None if no frame has an answer."""
     unanswered: int
     why: str = ""
     """Cause of the first missing answer, if known."""
 
     @property
-    def added_us(self) -> float:
-        """Return the additional time of the remote detector, us."""
-        return self.there_us - self.here_us
+    def added_us(self) -> float | None:
+        """Return the additional time of the remote detector, us, or None if one of the two gives no answer."""
+        return None if self.here_us is None or self.there_us is None else self.there_us - self.here_us
 
 
 def measure_cost(here: Detector, there: Detector, jpeg: bytes, size_px: tuple[int, int], *, frames: int = 300,
@@ -90,18 +93,30 @@ def measure_cost(here: Detector, there: Detector, jpeg: bytes, size_px: tuple[in
     """Send `frames` frames to both detectors. With `robot` they are also published, for a service that subscribes."""
     decoder, numbers, took = Decoder(*size_px, size_px[0] * size_px[1]), count(1), (list[float](), list[float]())
     unanswered, why = 0, ""
-    next_s = time.monotonic()
+    next_s = status_s = time.monotonic()
     for index in range(_WARM + frames):
+        if robot is not None and time.monotonic() >= status_s:
+            publish_status(robot)
+            status_s = time.monotonic() + _PRESENT_S
         next_s += period_s
         time.sleep(max(0.0, next_s - time.monotonic()))
         for which, one in enumerate((here, there)):
             frame = DetectFrame("r1", _header(next(numbers)), jpeg, decoder)
             us, result = _timed(one, frame, robot if which else None)
-            if index >= _WARM:
+            if index < _WARM:
+                continue
+            if isinstance(result, str):
+                unanswered, why = unanswered + 1, why or result
+            else:
                 took[which].append(us)
-                unanswered += isinstance(result, str)
-                why = why or (result if isinstance(result, str) else "")
-    return Cost(median(took[0]), median(took[1]), unanswered, why)
+    here_us, there_us = (median(one) if one else None for one in took)
+    return Cost(here_us, there_us, unanswered, why)
+
+
+def publish_status(robot: Link, number: int = 1) -> None:
+    """Publish the status of a robot, which counts as gone without one."""
+    stamp = encode(Stamp(session="0000abcd", seq=number, t_us=monotonic_us()))
+    robot.publish(STATUS, stamp, encode(Status(state=State.HOLD, reason="bench")))
 
 
 def _timed(detector: Detector, frame: DetectFrame, robot: Link | None) -> tuple[float, DetectionResult | str]:
@@ -302,13 +317,12 @@ class _Streams:
         return note
 
     def publish_status(self) -> None:
-        """Publish the status of each robot once a second; a robot without one counts as gone."""
+        """Publish the status of each robot once a second, and more often until the run begins."""
         if time.monotonic() - self._published_s < _STATUS_S:
             return
-        self._published_s = time.monotonic() + 1.0 - _STATUS_S if self.counting else time.monotonic()
-        stamp = encode(Stamp(session="0000abcd", seq=self._seq, t_us=monotonic_us()))
+        self._published_s = time.monotonic() + _PRESENT_S - _STATUS_S if self.counting else time.monotonic()
         for link in self._links:
-            link.publish(STATUS, stamp, encode(Status(state=State.HOLD, reason="bench")))
+            publish_status(link, self._seq)
 
     def frame(self, index: int) -> None:
         self._seq += 1

@@ -340,7 +340,7 @@ def detector(
 
     with needs("vision"):
         from sightline.benchmarks.detector import HOT_S, PACED_S, measure_cost
-        from sightline.evaluation.checks import at_most
+        from sightline.evaluation.checks import at_most, number
         from sightline.vision_side.config import VisionConfig
         from sightline.vision_side.detect.plugin_calls import attach_detector, close_detector
         from sightline.vision_side.detect.registry import build_detector
@@ -357,7 +357,8 @@ def detector(
             close_detector(there)
     bound, checks, most = _BOUND_US.get(name.partition(":")[0], float("inf")), [], 0.01 * frames
     for way, cost in costs.items():
-        what = f"{name}: added, {way} (here {cost.here_us:.0f}, there {cost.there_us:.0f}, medians)"
+        here_text, there_text = map(number, (cost.here_us, cost.there_us))
+        what = f"{name}: added, {way} (here {here_text}, there {there_text}, medians)"
         checks.append(at_most(what, cost.added_us, "us", bound if way == "hot" else float("inf")))
         why = f" ({cost.why})" if cost.why else ""
         checks.append(at_most(f"{name}: unanswered of {frames}, {way}{why}", cost.unanswered, "", most))
@@ -412,13 +413,10 @@ def _service(name: str, folder: Path) -> "Iterator[Any]":
 
 def _publish_status(robot: Any, processes: Any) -> None:
     """Publish the status until the service subscribes to the frames."""
-    from sightline.protocol.channels import STATUS
-    from sightline.protocol.codec import encode
-    from sightline.protocol.messages import Stamp, State, Status
+    from sightline.benchmarks.detector import publish_status
 
-    stamp, status = encode(Stamp(session="0000abcd", seq=1, t_us=1)), encode(Status(state=State.HOLD, reason="bench"))
     while "receives the frames" not in processes.log("detector").read_text("utf-8", "replace"):
-        robot.publish(STATUS, stamp, status)
+        publish_status(robot)
         processes.check(0.1)
 
 

@@ -1,15 +1,19 @@
 """`sightline bench detector`, `bench streams` and `bench pipeline`: their checks on invented runs."""
 
+import json
+import time
 from collections import Counter
 from dataclasses import replace
-from itertools import chain, repeat
+from itertools import chain, count, groupby, repeat
 from types import SimpleNamespace
 
 import pytest
 
+from sightline.benchmarks import detector as detector_bench
 from sightline.benchmarks import pipeline
 from sightline.benchmarks.detector import (
     OVERLOAD,
+    Cost,
     Load,
     SlowDetector,
     StreamPlan,
@@ -24,6 +28,7 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import DetectionsHeader, Echo
 from sightline.protocol.transports.link import Message
 from sightline.vision_side.detect.port import Maker, result_of
+from tests.fixtures.commands import run
 
 ROBOTS = [f"s{index}" for index in range(40)]
 SECONDS = 60
@@ -134,3 +139,43 @@ def test_answer_that_the_vision_service_would_not_use_is_not_an_answer(detect, u
     jpeg = pipeline._encode(pipeline._drawn(320, 240, 1, 1), 80)
     cost = measure_cost(here, there, jpeg, (320, 240), frames=4)
     assert cost.unanswered == unanswered and why in cost.why and bool(why) is bool(cost.why)
+    assert (cost.added_us is None) is (cost.there_us is None) is bool(why)
+
+
+@pytest.mark.parametrize("each", [2, 3, 5])
+def test_time_of_a_frame_without_an_answer_is_not_counted(each):
+    calls = count()
+
+    def detect(frames, _deadline_us):
+        if next(calls) % each:
+            return [None]
+        time.sleep(0.004)
+        return [result_of(frames[0], (), Maker("x", device="cpu"))]
+
+    jpeg = pipeline._encode(pipeline._drawn(320, 240, 1, 1), 80)
+    cost = measure_cost(SlowDetector(SlowDetector.Config(each_us=0)), SimpleNamespace(detect=detect), jpeg, (320, 240),
+                        frames=15)
+    assert cost.there_us >= 4000 and cost.added_us > 0 and 0 < cost.unanswered < 15
+
+
+def test_robot_of_a_bench_stays_present(monkeypatch):
+    """Before, a service ended its subscription in the middle of the run, and a third of the frames had no answer."""
+    now_s, published = count(step=0.25), []
+    clock = SimpleNamespace(monotonic=lambda: next(now_s), sleep=lambda _seconds: None,
+                            perf_counter_ns=time.perf_counter_ns)
+    monkeypatch.setattr(detector_bench, "time", clock)
+    here = SlowDetector(SlowDetector.Config(each_us=0))
+    robot = SimpleNamespace(publish=lambda channel, *_: published.append(channel.name))
+    measure_cost(here, here, b"", (320, 240), frames=60, robot=robot)
+    longest = max(len(list(run)) for name, run in groupby(published) if name == "frame")
+    assert published[0] == "status" and longest <= 4
+
+
+@pytest.mark.parametrize(("answer", "value"), [("", None), ("x", 0.0)])
+def test_detector_that_gives_no_answer_has_no_time_that_is_ok(monkeypatch, capsys, answer, value):
+    cost = Cost(700.0, 700.0 if answer else None, 0 if answer else 300, answer)
+    monkeypatch.setattr(detector_bench, "measure_cost", lambda *_given, **_more: cost)
+    code, out, _ = run(capsys, "bench", "detector", "hsv", "--frames", "300", "--json")
+    checks = {one["name"].split(",")[0]: one for one in json.loads(out)["checks"]}
+    assert code == (0 if answer else 5)
+    assert (checks["hsv: added"]["value"], checks["hsv: added"]["ok"]) == (value, bool(answer))
