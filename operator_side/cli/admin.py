@@ -5,7 +5,7 @@ import json
 import os
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import chdir, suppress
 from datetime import UTC, datetime
 from importlib import import_module
 from pathlib import Path
@@ -26,6 +26,7 @@ from sightline.operator_side.cli.options import (
     plugin_prints,
     print_result,
 )
+from sightline.operator_side.cli.services import check_names
 from sightline.operator_side.client.pictures import viewer_role
 from sightline.operator_side.client.requests import Operator
 from sightline.operator_side.config import context as contexts
@@ -233,6 +234,9 @@ def install(
             typer.echo(f"{file} does not exist yet{second}; create it before --yes", err=True)
         return
     units.check_user(runs_it, program, file)
+    if loaded is not None:
+        with chdir(file.parent):  # the folder of the service, from which it loads plug-ins
+            check_names(loaded)
     if state_dir is not None and not state_dir.is_dir():  # systemd would not start the service
         raise ConfigError(f"state_dir {state_dir} does not exist; run: sudo install -d -o {runs_it} {state_dir}")
     stale = units.drop_in_path(planned.path.parent)

@@ -389,11 +389,11 @@ def check(service: ServiceName, file: File = None, profile: Profile = None, sets
     Exit code 2 means that it is invalid; the error names the value.
     """
     loaded = load_service(service, profile=profile, file=file, sets=sets or (), environ=os.environ)
-    _check_names(loaded.config)
+    check_names(loaded.config)
     typer.echo(f"{file or service}: valid, {len(loaded.given)} values set, the others are defaults")
 
 
-def _check_names(config: BaseModel) -> None:
+def check_names(config: BaseModel) -> None:
     """Check that devices, scenario, robot, detectors and missions exist, and their options. Opens no device."""
     # Here, because each service starts a fifth sooner without the models of the others.
     from sightline.robot_side.config import RobotConfig

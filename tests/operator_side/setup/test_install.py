@@ -330,6 +330,22 @@ def test_wrong_pins_are_not_installed(car, capsys):
     assert (list(units.iterdir()), told) == ([], [])
 
 
+@pytest.mark.parametrize(("group", "kind", "shown"), [
+    ("drive", "gpoi", "'gpoi'"), ("drive", "a_plugin_of_a_test:Other", "Other"),
+    ("camera", "no_module:Camera", "no_module"), ("drive", "a_plugin_of_a_test:Drive", "")])
+def test_service_whose_plugin_does_not_load_is_not_installed(group, kind, shown, car, capsys):
+    file, units, told = car
+    file.with_name("a_plugin_of_a_test.py").write_text(
+        "import pydantic\n\n\nclass Drive:\n    class Config(pydantic.BaseModel):\n        pass\n\n"
+        "    def __init__(self, config):\n        raise OSError('a device of the robot')\n\n"
+        "    @staticmethod\n    def zero(config):\n        pass\n")
+    file.write_text(f'[{group}]\nkind = "{kind}"\n')
+    code = cli.run(["install", "robot", "--config", str(file), "--user", "pi", "--yes"])
+    printed = capsys.readouterr().err
+    assert (code, bool(told), bool(list(units.iterdir()))) == ((2, False, False) if shown else (0, True, True)), printed
+    assert shown in printed and printed.count("\n") == (1 if shown else 0)
+
+
 def test_both_files_are_written_only_with_yes(car, capsys):
     file, units, told = car
     command = ["install", "robot", "--config", str(file), "--user", "pi"]
