@@ -234,9 +234,8 @@ def install(
             typer.echo(f"{file} does not exist yet{second}; create it before --yes", err=True)
         return
     units.check_user(runs_it, program, file)
-    if loaded is not None:
-        with chdir(file.parent):  # the folder of the service, from which it loads plug-ins
-            check_names(loaded)
+    with chdir(file.parent):  # the folder of the service, from which it loads plug-ins
+        check_names(loaded)
     if state_dir is not None and not state_dir.is_dir():  # systemd would not start the service
         raise ConfigError(f"state_dir {state_dir} does not exist; run: sudo install -d -o {runs_it} {state_dir}")
     stale = units.drop_in_path(planned.path.parent)

@@ -70,12 +70,13 @@ def demo(
     _check_installed("pybullet", "av", "matplotlib", "mcap")
     with needs("all"):
         from sightline.evaluation.demo.report import report, summary, write_files
-        from sightline.evaluation.demo.run import DemoOptions, run_demo
+        from sightline.evaluation.demo.run import DemoOptions, run_demo, usual_s
+        from sightline.sim.scenario import load_scenario
     show = _to_stderr if as_json else typer.echo
     if story:
         _check_story(DemoOptions(scenario, seconds or 0.0, seed, latency_ms, loss, out, transport, mission, detector))
         return _make_story(out, seed, show, as_json=as_json, open_it=open_it)
-    lasting_s = _seconds(scenario, seconds)
+    lasting_s = usual_s(load_scenario(scenario)) if seconds is None else seconds
     options = DemoOptions(scenario, lasting_s, seed, latency_ms, loss, out, transport, mission, detector)
     with plugin_prints(as_json):
         run = run_demo(options, show)
@@ -109,17 +110,6 @@ def _make_story(out: Path | None, seed: int, show: Callable[[str], None], *, as_
     if open_it:
         webbrowser.open((result.folder / FILM).as_uri())
     return code
-
-
-def _seconds(scenario: str, given: float | None) -> float:
-    """Return the length of a demo: the given one, that of the course, or 20 s."""
-    from sightline.sim.scenario import load_scenario
-
-    if given is not None:
-        return given
-    loaded = load_scenario(scenario)
-    is_course = loaded.goals_m or loaded.light or "least_passes" in loaded.bounds
-    return loaded.seconds if is_course else 20.0
 
 
 def _check_installed(*packages: str) -> None:

@@ -393,7 +393,7 @@ def check(service: ServiceName, file: File = None, profile: Profile = None, sets
     typer.echo(f"{file or service}: valid, {len(loaded.given)} values set, the others are defaults")
 
 
-def check_names(config: BaseModel) -> None:
+def check_names(config: BaseModel | None) -> None:
     """Check that devices, scenario, robot, detectors and missions exist, and their options. Opens no device."""
     # Here, because each service starts a fifth sooner without the models of the others.
     from sightline.robot_side.config import RobotConfig
