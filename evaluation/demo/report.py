@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sightline.evaluation.checks import Check, at_most, check_lines, to_dict
-from sightline.evaluation.demo.run import MOTOR_LOG, OTHER_FOLDER, RECORDING, DemoRun
+from sightline.evaluation.demo.run import MOTOR_LOG, OTHER_FOLDER, RECORDING, DemoRun, usual_s
 from sightline.evaluation.demo.shaped_vision import INJECTED
 from sightline.evaluation.faults.evidence import read_motors
 from sightline.evaluation.processes import last_line
@@ -34,6 +34,7 @@ from sightline.operator_side.recording.recorder import read_recording
 from sightline.operator_side.recording.replay import Replayed, replay
 from sightline.protocol.channels import STATUS
 from sightline.protocol.errors import CheckError, ConfigError, WireError
+from sightline.sim.scenario import AT_LEAST
 
 if TYPE_CHECKING:
     from sightline.evaluation.plots import StatusAt
@@ -175,8 +176,11 @@ def _hold_checks(run: DemoRun) -> list[Check]:
     options = run.options
     if options.loss > HOLDS_LOSS or options.latency_ms > HOLDS_LATENCY_MS or options.transport == "legacy":
         return []
-    seconds = round((run.samples[-1].t_us - run.samples[0].t_us) / 1e6)
-    return [at_most("holds", run.holds, "", HOLDS_A_MINUTE * seconds / 60)]
+    return [at_most("holds", run.holds, "", HOLDS_A_MINUTE * _lasted_s(run) / 60)]
+
+
+def _lasted_s(run: DemoRun) -> int:
+    return round((run.samples[-1].t_us - run.samples[0].t_us) / 1e6)
 
 
 def _checks(run: DemoRun, result: Score) -> list[Check]:
@@ -204,10 +208,19 @@ def summary(scored: DemoReport) -> list[str]:
     if run.killed:
         lines.append(f"had to be killed: {', '.join(run.killed)}; see their logs")
     if scored.ok is False:
-        lines += _late_lines(run.folder / "sim.log")
+        lines += [*_short_lines(scored), *_late_lines(run.folder / "sim.log")]
     lines += _detector_lines(run.folder / "vision.log")
     lines.append(f"left in {run.folder}: score.json trajectory.png run.mp4 run.mcap motors.csv *.log")
     return [*lines, _next_thing(run)]
+
+
+def _short_lines(scored: DemoReport) -> list[str]:
+    """Return a line if figures are missing because the run ended before the robot had time for them."""
+    lasted_s, needed_s = _lasted_s(scored.run), usual_s(scored.run.scenario)
+    is_missing = any(not one.ok and (one.value is None or one.name.startswith(AT_LEAST)) for one in scored.checks)
+    if lasted_s >= needed_s or not is_missing:
+        return []
+    return [f"the run of {lasted_s} s was too short for these bounds; repeat it with --seconds {needed_s:g}"]
 
 
 def _late_lines(log: Path) -> list[str]:

@@ -72,12 +72,15 @@ TRANSPORTS: Final = {"zenoh": "tcp/127.0.0.1:{}", "websocket": "ws://127.0.0.1:{
 """Endpoint of the vision service by transport. The operator and the recorder always use Zenoh."""
 
 
+_USUAL_S: Final = 20.0
+
+
 @dataclass(frozen=True, slots=True)
 class DemoOptions:
     """The options of a demo. `seconds` 0 runs until Ctrl-C."""
 
     scenario: str = "circle"
-    seconds: float = 20.0
+    seconds: float = _USUAL_S
     seed: int = 1
     latency_ms: float = 0.0
     loss: float = 0.0
@@ -99,6 +102,12 @@ class DemoOptions:
                 raise ConfigError(f"{option} {value}: expected {expected}")
         if self.transport not in TRANSPORTS:
             raise ConfigError(no_such_name("--transport", self.transport, TRANSPORTS))
+
+
+def usual_s(scenario: Scenario) -> float:
+    """Return the length of a demo without --seconds: that of the course, or 20 s."""
+    is_course = scenario.goals_m or scenario.light or "least_passes" in scenario.bounds
+    return scenario.seconds if is_course else _USUAL_S
 
 
 @dataclass(slots=True)

@@ -17,6 +17,7 @@ import pytest
 
 from sightline.benchmarks import real_time
 from sightline.benchmarks.real_time import Kinds, _figures, measure_demos
+from sightline.evaluation.checks import Check
 from sightline.evaluation.demo import report as demo_report
 from sightline.evaluation.demo import run as demo_run
 from sightline.evaluation.demo import video
@@ -121,6 +122,21 @@ def test_loss_may_stop_the_robot_once_a_minute(lights, options, seconds, holds, 
                      samples=[lights.samples[0], replace(lights.samples[-1], t_us=ends_us)])
     checks = demo_report._injection_checks(driven, None)
     assert next((check.ok for check in checks if check.name == "holds"), None) is ok
+
+
+@pytest.mark.parametrize("name", ["circle", "traffic-light", "eight"])
+def test_summary_of_a_failed_short_run_names_the_time_that_it_needs(lights, scored, name):
+    scenario = load_scenario(name)
+    needed_s = demo_run.usual_s(scenario)
+    missing = [Check("acquired_s", None, "s", 12.0, False), Check("least_passes", 1.0, "", 2.0, False)]
+    beyond = Check("wall_contacts", 3.0, "steps", 0.0, False)
+    for lasted_s, check, is_named in [(3, missing[0], True), (needed_s - 1, missing[1], True), (3, beyond, False),
+                                      (needed_s, missing[0], False)]:
+        samples = [lights.samples[0], replace(lights.samples[-1], t_us=lights.samples[0].t_us + int(lasted_s * 1e6))]
+        driven = replace(lights, scenario=scenario, samples=samples)
+        lines = demo_report.summary(replace(scored, run=driven, checks=[check]))
+        line = f"the run of {lasted_s:g} s was too short for these bounds; repeat it with --seconds {needed_s:g}"
+        assert (line in lines) is is_named
 
 
 @pytest.mark.parametrize(("dropped", "loss", "fix"), [
