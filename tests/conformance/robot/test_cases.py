@@ -123,6 +123,14 @@ def test_robot_whose_lease_a_rejected_command_renews_fails(reason):
     assert result_of(CASES_BY_ID["R-LEASE-06"], renews).outcome is Outcome.FAILED
 
 
+@pytest.mark.parametrize("age_ms", [400, 700, 950])
+def test_robot_that_accepts_older_frames_passes_the_case_about_rejected_twists(age_ms):
+    limits = {"zero_speed_age_ms": age_ms, "silence_ms": 250, "max_linear_mps": 0.15, "max_angular_rad_s": 1.0}
+    bench, _robot = virtual_robot(**limits)
+    result = run_case(CASES_BY_ID["R-LEASE-06"], bench, prepare)
+    assert result.outcome is Outcome.PASSED, result.reason
+
+
 def test_robot_that_counts_accepted_commands_again_after_a_stop_fails():
     def bend(_header, payload):
         payload["accepted"] = 0 if payload["state"] in ("STOPPED", "DISARMED") else payload["accepted"]
