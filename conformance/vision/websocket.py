@@ -62,6 +62,7 @@ class RawServer:
             self._socket.close()
             raise LinkError(f"ws://{host}:{port} cannot be listened on: {error.strerror}") from None
         self._socket.listen(4)
+        self._answered_s = time.monotonic()
         self._clients: list[AcceptedClient] = []
 
     def accept(self, within_s: float) -> "AcceptedClient | None":
@@ -83,22 +84,22 @@ class RawServer:
         return None
 
     def turn_away(self, within_s: float) -> float:
-        """Answer the next request with 503. Returns the seconds until it came; infinite if none came."""
-        began_s = time.monotonic()
+        """Answer the next request with 503. Returns the seconds since the last answer; infinite if none came."""
         self._socket.settimeout(within_s)
         try:
             connection, _ = self._socket.accept()
         except TimeoutError:
             return math.inf
-        came_s = time.monotonic() - began_s
+        pause_s = time.monotonic() - self._answered_s
         # Without an answer some HTTP libraries repeat a request by themselves.
         with suppress(OSError), connection:
             connection.settimeout(_SEND_S)
             secured = connection if self._tls is None else self._tls.wrap_socket(connection, server_side=True)
             with secured:
                 secured.recv(_REQUEST_BYTES)
+                self._answered_s = time.monotonic()
                 secured.sendall(b"HTTP/1.1 503 Service Unavailable\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
-        return came_s
+        return pause_s
 
     def __enter__(self) -> Self:
         return self

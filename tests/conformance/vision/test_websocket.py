@@ -1,7 +1,9 @@
 """The kit's cases with sockets of their own: ours passes, and a plain client passes."""
 
 import json
+import socket
 import threading
+import time
 from contextlib import contextmanager, nullcontext
 
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from sightline.conformance.raw_peers import RawFrame, take_frame
 from sightline.conformance.runner import Outcome, run_case
 from sightline.conformance.vision.cases import CASES
+from sightline.conformance.vision.websocket import RawServer
 from sightline.operator_side.cli import app as cli
 from sightline.protocol.text import format_twist
 from sightline.protocol.transports.open import open_link
@@ -55,6 +58,23 @@ def test_answer_with_a_long_block_or_as_a_text_fails(monkeypatch, name, message)
         assert bench.wait(lambda: bench._links["robot"].connected, 5_000_000)
         result = run_case(case, bench)
     assert result.outcome is Outcome.FAILED, result.reason
+
+
+@pytest.mark.parametrize("kit_waits_s", [0.0, 0.1, 0.25])
+def test_pause_before_a_try_is_right_while_the_kit_has_no_processor(kit_waits_s):
+    endpoint, pauses_s = free_endpoint("ws://"), []
+    host, port = endpoint.removeprefix("ws://").split(":")
+    with RawServer(host, int(port)) as server:
+        tries = threading.Thread(target=lambda: [pauses_s.append(server.turn_away(1.0)) or time.sleep(kit_waits_s)
+                                                 for _ in range(3)])
+        tries.start()
+        for _ in range(3):
+            with socket.create_connection((host, int(port))) as client:
+                client.sendall(b"GET / HTTP/1.1\r\n\r\n")
+                assert client.recv(100).startswith(b"HTTP/1.1 503")
+            time.sleep(0.2)
+        tries.join()
+    assert min(pauses_s[1:]) >= 0.2
 
 
 def test_vision_service_that_swaps_the_axes_exits_with_5(capsys, monkeypatch):
