@@ -396,12 +396,11 @@ class Driver:
     def _keep_network(self, now_us: int) -> None:
         """Start the network process if it is not running."""
         # On a busy machine a start takes long, and the guardian would end a healthy loop. Meanwhile the wheels stand.
-        guardian = self._guardian if self._is_at_rest else None
-        may_wait = guardian is not None and self.driver_end.is_start_due(now_us)
-        if guardian is not None and may_wait:
+        guardian = self._guardian if self._is_at_rest and self.driver_end.is_start_due(now_us) else None
+        if guardian is not None:
             guardian.beat(STARTING)
         self.driver_end.keep_alive(now_us, self._driver_core.gate.issued.last_seq("frame") + 1)
-        if guardian is not None and may_wait:
+        if guardian is not None:
             guardian.beat(AT_REST)
 
     def _answer(self) -> None:
