@@ -545,7 +545,7 @@ def credit_passes_on(bench: Bench, first: Sender) -> None:
     first.fall_silent()
     bench.rest(OWNED_US)
     Sender(first.robot, bench.access.watcher)
-    bench.rest(300_000)
+    bench.rest(OWNED_US)
     fps = fps_of(bench)
     bench.expect(fps >= 0.7 * quick, f"{quick:.0f} fps to the first, {fps:.0f} to the second")
 

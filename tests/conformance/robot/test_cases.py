@@ -12,6 +12,7 @@ from sightline.conformance.runner import Outcome, chosen, passed, run_case, run_
 from sightline.protocol import proof
 from sightline.protocol.channels import STATUS
 from sightline.protocol.errors import CLAMPED, ConfigError
+from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.robot_side.network.core import NetworkCore
 from sightline.robot_side.network.stream import StreamConfig
 from tests.conformance.clauses import clauses
@@ -215,6 +216,23 @@ def test_robot_with_a_fast_camera_widens_its_window_on_a_long_link(monkeypatch, 
 
     result = result_of(CASES_BY_ID["R-FLOW-07"], streams_all)
     assert result.outcome is Outcome.PASSED, result.reason
+
+
+@pytest.mark.parametrize("delay_us", [80_000, 150_000])
+@pytest.mark.parametrize("name", ["R-FLOW-14", "R-RECO-04"])
+def test_our_robot_passes_over_a_slow_link(monkeypatch, name, delay_us):
+    monkeypatch.setattr(reference, "MemoryNetwork", lambda: MemoryNetwork(delay_us=delay_us))
+    result = result_of(CASES_BY_ID[name])
+    assert result.outcome is Outcome.PASSED, result.reason
+
+
+@pytest.mark.parametrize(("joins_after_us", "outcome"), [(200_000, Outcome.PASSED), (900_000, Outcome.SKIPPED)])
+def test_lease_that_ended_while_the_kit_connected_again_is_no_failure(monkeypatch, joins_after_us, outcome):
+    bench, _robot = virtual_robot()
+    join = bench.join
+    monkeypatch.setattr(bench, "join", lambda: bench.rest(joins_after_us) or join())
+    result = run_case(CASES_BY_ID["R-RECO-04"], bench, prepare)
+    assert result.outcome is outcome, result.reason
 
 
 def test_robot_that_counts_no_twist_of_a_second_driver_fails():
