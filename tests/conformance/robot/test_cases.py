@@ -227,7 +227,7 @@ def test_our_robot_passes_over_a_slow_link(monkeypatch, name, delay_us):
 
 
 @pytest.mark.parametrize(("joins_after_us", "outcome"), [(200_000, Outcome.PASSED), (900_000, Outcome.SKIPPED)])
-def test_lease_that_ended_while_the_kit_connected_again_is_no_failure(monkeypatch, joins_after_us, outcome):
+def test_lease_that_ended_while_the_kit_connected_again_is_not_a_failure(monkeypatch, joins_after_us, outcome):
     bench, _robot = virtual_robot()
     join = bench.join
     monkeypatch.setattr(bench, "join", lambda: bench.rest(joins_after_us) or join())
