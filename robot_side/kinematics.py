@@ -122,7 +122,7 @@ class WheelMonitor:
         """Begin. `max_rad_s`: highest commanded speed. Pushed or downhill, a wheel may be twice as fast."""
         self._max_rad_s = 2 * max_rad_s
         self._last: tuple[float, int] | None = None
-        self._from_rad = self._commanded_rad = 0.0
+        self._from_rad = self._commanded_rad = self._unseen_rad = 0.0
         self._since_us = 0
 
     def look(self, commanded_rad: float, angle_rad: float, t_us: int, now_us: int) -> str:
@@ -138,10 +138,14 @@ class WheelMonitor:
         self._last = (angle_rad, t_us) if t_us > last_us or self._last is None else self._last
         step_rad, step_us = abs(self._last[0] - last_rad), max(self._last[1] - last_us, _AT_ONCE_US)
         self._commanded_rad += commanded_rad
-        self.jumped = step_rad > self._max_rad_s * step_us / 1e6 + _STEP_RAD
+        # A slow encoder whose old readings have new times turns at once by what was commanded since its last change.
+        self._unseen_rad += abs(commanded_rad)
+        self.jumped = step_rad > max(self._max_rad_s * step_us / 1e6, 2 * self._unseen_rad) + _STEP_RAD
+        self._unseen_rad *= step_rad == 0
         doubt = f"jumped by {step_rad:.3g} rad; look for a loose wire, or a counter that wraps" if self.jumped else ""
         if not doubt and now_us - self._since_us >= _COMPARED_US and abs(self._commanded_rad) >= math.tau:
             doubt = self._compared(self._last[0] - self._from_rad)
+            self._unseen_rad *= not doubt
         elif not doubt and commanded_rad * self._commanded_rad > 0:
             return ""
         self._since_us, self._from_rad, self._commanded_rad = now_us, self._last[0], 0.0

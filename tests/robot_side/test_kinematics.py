@@ -1,6 +1,7 @@
 """Differential drive and odometry: exact on arcs, the curve kept under saturation."""
 
 import math
+from functools import partial
 
 import pytest
 from hypothesis import given
@@ -241,7 +242,9 @@ SPEEDS = [0.3, 2.0, 8.0, 14.0, 22.0, -0.3, -14.0, -22.0]
 
 @pytest.mark.parametrize("speed", SPEEDS)
 @pytest.mark.parametrize("steps", [12, 360, 4096])
-@pytest.mark.parametrize(("read_s", "own_time"), [(0.02, True), (0.1, True), (0.1, False), (1.0, True)])
+@pytest.mark.parametrize(("read_s", "own_time"), [
+    (0.02, True), (0.1, True), (0.1, False), (0.3, False), (1.0, False), (1.0, True),
+])
 def test_encoders_that_are_coarse_or_slow_are_not_doubted(speed, steps, read_s, own_time):
     step_rad = math.tau / steps
     assert not doubts_of(lambda _: speed, lambda true, _: true // step_rad * step_rad, read_s=read_s, own_time=own_time)
@@ -316,6 +319,15 @@ def test_jump_of_either_wheel_is_known_until_the_next_reading(jumps):
         monitor.look((0.0, 0.0), WheelAngles(*angles, t_us), t_us)
         seen.append(monitor.jumped)
     assert seen == [False, False, True, False]
+
+
+@pytest.mark.parametrize("speed", [22.0, -22.0])
+def test_jump_of_an_encoder_that_stood_still_while_it_was_commanded_is_named(speed):
+    """Twice the commanded turn may be true; a wheel that was named as standing still begins again."""
+    for at_s, jump, is_found in ((0.5, 20.0, False), (0.5, 25.0, True), (2.5, 25.0, True), (8.5, 25.0, True)):
+        stuck = partial(lambda _, now_s, at_s, jump: jump * (now_s >= at_s), at_s=at_s, jump=jump)
+        found = doubts_of(lambda _: speed, stuck, seconds=at_s + 0.1)
+        assert any("jumped" in doubt for _, doubt in found) is is_found
 
 
 @pytest.mark.parametrize("max_rad_s", [5.0, 22.0, 100.0])
