@@ -143,9 +143,21 @@ def pack_counts(kind: PacketKind, counts: Mapping[str, int]) -> bytes:
 
 
 def unpack_counts(packet: bytes) -> dict[str, int]:
-    """Decode a packet of `pack_counts`."""
-    counts = json.loads(packet[1:])
-    return {str(reason): int(count) for reason, count in counts.items()}
+    """Decode a packet of `pack_counts`. Raises ValueError for counts that a status cannot contain."""
+    try:
+        counts = json.loads(packet[1:])
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    if not isinstance(counts, dict) or len(counts) > _MAX_COUNTS or not all(
+        name.isascii() and len(name) <= _MAX_COUNTS and type(count) is int and 0 <= count < _MAX_COUNT
+        for name, count in counts.items()
+    ):
+        raise ValueError("invalid counts")
+    return counts
+
+
+_MAX_COUNTS: Final = 64  # of names, and of their letters
+_MAX_COUNT: Final = 1 << 32
 
 
 def pack_token(token: str, is_present: bool) -> bytes:
@@ -155,7 +167,8 @@ def pack_token(token: str, is_present: bool) -> bytes:
 
 def unpack_token(packet: bytes) -> tuple[str, bool]:
     """Decode a packet of `pack_token`: (token, is_present)."""
-    return packet[2:].decode(), bool(packet[1])
+    is_present, = packet[1:2]
+    return packet[2:].decode(), bool(is_present)
 
 
 def pack_message(kind: PacketKind, message: Message) -> bytes:

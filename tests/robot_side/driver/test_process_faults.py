@@ -219,10 +219,25 @@ def test_first_speeds_may_have_reached_a_drive_that_raised(driver):
     assert gate.applied.linear_mps > 0
 
 
-@pytest.mark.parametrize("packet", [b"\xff", b"\x01", b"\x02", b"\x03{", bytes([ipc.PacketKind.RAW]) + b"x" * 40])
+@pytest.mark.parametrize("packet", [b"\xff", b"\x01", b"\x02", b"\x03{", bytes([ipc.PacketKind.RAW]) + b"x" * 40,
+                                    bytes([ipc.PacketKind.TOKEN])])
 def test_a_packet_that_is_invalid_is_dropped(driver, packet):
     driver.driver_end.packets = lambda: iter([packet])
     assert driver._drain() is False
+
+
+@pytest.mark.parametrize("kind", [ipc.PacketKind.REJECTED, ipc.PacketKind.FAULTS])
+@pytest.mark.parametrize("counts", [
+    b"[]", b"null", b"1", b'"a"', b"[" * 100_000, b'{"a":[]}', b'{"a":1e400}', b'{"a":true}', b'{"a":-1}',
+    b'{"a":%d}' % 2**53, b'{"\\ud800":1}', b'{"%s":1}' % (b"a" * 65),
+    b"{%s}" % b",".join(b'"%d":1' % number for number in range(65)),
+], ids=range(13))
+def test_counts_of_a_broken_network_process_neither_end_the_loop_nor_spoil_the_status(driver, kind, counts):
+    driver.driver_end.packets = lambda: iter([bytes([kind]) + counts])
+    assert driver._drain() is False
+    driver._tick(20_000)
+    status = driver._driver_core.status(40_000)
+    assert status.refused == {} and "a" not in status.faults
 
 
 @pytest.fixture
