@@ -18,6 +18,7 @@ from sightline.operator_side.cli.options import (
     CameraKind,
     CameraSets,
     Json,
+    Robot,
     RobotName,
     Secure,
     check_camera_sets,
@@ -263,9 +264,11 @@ def _show(planned: units.InstallPlan, beside: units.InstallPlan | None) -> None:
 
 def doctor(
     *,
-    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="Robot id.")] = contexts.DEFAULT_ROBOT,
+    robot: Robot = None,
     peer: Annotated[
-        str | None, typer.Option("--peer", metavar="ENDPOINT", help="Also check the link to this robot or router.")
+        str | None,
+        typer.Option("--peer", metavar="ENDPOINT",
+                     help="Also check the link to it [default: SIGHTLINE_CONNECT or `sightline use`, if set]."),
     ] = None,
     camera: CameraKind = None,
     camera_sets: CameraSets = None,
@@ -274,17 +277,18 @@ def doctor(
 ) -> int:
     """Find common problems and print how to fix them
 
-    It checks this machine, and with --peer the link to a robot. Exit code 5 means that it found a problem.
+    It checks this machine, and with an address the link to a robot. Exit code 5 means that it found a problem.
     """
-    if "/" in robot:
+    if robot and "/" in robot:
         raise ConfigError(f"robot '{robot}' is an address; run `sightline doctor --peer {robot}`")
-    check_robot_id(robot)
     check_camera_sets(camera, camera_sets)
-    if peer is not None:
-        check_endpoint(peer)
+    target = contexts.target_of(robot, None if peer is None else [peer], secure)
+    peers = () if target.origin == "default" else target.connect
+    if peers and peer is None:
+        typer.echo(str(target), err=True)
     found: list[Finding] = []
     with plugin_prints(as_json):
-        for finding in _findings(robot, peer, camera, camera_sets or [], secure):
+        for finding in _findings(target._replace(connect=peers), camera, camera_sets or []):
             found.append(finding)
             if not as_json:
                 typer.echo(finding.line)
@@ -293,14 +297,14 @@ def doctor(
     return print_result(as_object(found), [last], as_json)
 
 
-def _findings(robot: str, peer: str | None, camera: str | None, sets: list[str], secure: str) -> Iterator[Finding]:
+def _findings(target: contexts.RobotAddress, camera: str | None, sets: list[str]) -> Iterator[Finding]:
     from sightline.operator_side.doctor import machine
     from sightline.operator_side.doctor import machine as cameras
     from sightline.operator_side.doctor import network as between
 
-    yield from machine.findings(secure)
+    yield from machine.findings(target.secure)
     yield from cameras.modes()
     if camera is not None:
         yield cameras.delivered(camera, sets)
-    if peer is not None:
-        yield from between.findings(peer, robot, secure)
+    for peer in target.connect:
+        yield from between.findings(peer, target.robot, target.secure)

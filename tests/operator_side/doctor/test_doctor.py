@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from sightline.operator_side.cli import app as cli
+from sightline.operator_side.config.context import Context, write_context
 from sightline.operator_side.doctor import machine
 from sightline.operator_side.doctor import machine as cameras
 from sightline.operator_side.doctor import network as between
@@ -263,6 +264,32 @@ def test_address_without_peer_is_rejected_with_the_option(capsys):
     assert cli.run(["doctor", "r*"]) == 2
     captured = capsys.readouterr()
     assert captured.out == "" and captured.err.startswith("error: invalid robot id 'r*': ")
+
+
+@pytest.mark.parametrize(("saved", "variable", "given", "expected", "origin"), [
+    (None, "", [], ("r1", (), ""), ""),
+    (Context("tcp/10.0.0.1:7447", "r7", "/keys"), "", [], ("r7", ("tcp/10.0.0.1:7447",), "/keys"), "context.toml"),
+    (Context("tcp/10.0.0.1:7447", "r7"), "", ["r8"], ("r8", ("tcp/10.0.0.1:7447",), ""), "context.toml"),
+    (Context("tcp/10.0.0.1:7447", "r7", "/keys"), "ws://a:1,ws://b:2", [], ("r1", ("ws://a:1", "ws://b:2"), ""),
+     "SIGHTLINE_CONNECT"),
+    (Context("tcp/10.0.0.1:7447", "r7", "/keys"), "ws://a:1", ["--peer", "tcp/c:3"], ("r1", ("tcp/c:3",), ""), ""),
+])
+def test_doctor_checks_the_address_of_other_client_commands(
+    saved, variable, given, expected, origin, capsys, monkeypatch, tmp_path
+):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    monkeypatch.setenv("SIGHTLINE_CONNECT", variable)
+    if saved:
+        write_context(tmp_path / "sightline/context.toml", saved)
+    checked = []
+    monkeypatch.setattr(cameras, "modes", list)
+    monkeypatch.setattr(machine, "findings", lambda secure: checked.append(secure) or [])
+    monkeypatch.setattr(between, "findings", lambda *link: checked.append(link) or [])
+    assert cli.run(["doctor", *given]) == 0
+    robot, peers, secure = expected
+    assert checked == [secure, *((peer, robot, secure) for peer in peers)]
+    printed = capsys.readouterr().err
+    assert origin in printed and bool(printed) is bool(origin)
 
 
 def test_missing_camera_is_reported(capsys):
