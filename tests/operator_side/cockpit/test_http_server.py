@@ -72,6 +72,16 @@ def test_other_host_name_is_rejected(port, host):
         assert answer.status == 403 and b"this machine only" in body
 
 
+@pytest.mark.parametrize("headers", [{}, {"Origin": "http://evil.example"}, {"Content_Type": "text/plain"}])
+@pytest.mark.parametrize(("path", "status"), [("/", 405), ("/broken?a=1", 405), ("/echo", None)])
+def test_post_to_an_address_for_get_is_answered_with_the_method(port, path, status, headers):
+    with asked(port, "POST", path, b"{}", **headers) as (answer, body):
+        assert (answer.status == 405) is (status == 405)
+        if status:
+            assert answer.getheader("Allow") == "GET, HEAD"
+            assert json.loads(body) == {"error": f"{path.partition('?')[0]} is only for GET, not for POST"}
+
+
 def test_only_posts_of_the_own_page_are_accepted(port):
     with asked(port, "POST", "/echo", b"{}", Origin=f"http://127.0.0.1:{port}") as (answer, body):
         assert (answer.status, body) == (200, b"{}")
