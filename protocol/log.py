@@ -18,7 +18,8 @@ import sys
 import threading
 import traceback
 from collections import Counter
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from typing import Final, TextIO
 
@@ -156,6 +157,24 @@ def start_log_thread() -> None:
     """Start the writing thread now, because a control loop must not wait for it at its first line."""
     with suppress(RuntimeError):
         _HANDLER.start()
+
+
+_SLOW_S: Final = 3.0
+_STACK_BYTES: Final = 256 * 1024
+
+
+@contextmanager
+def slow_logged(line: str) -> Iterator[None]:
+    """Log `line` if the block takes long, because until its device or model is open a service is silent."""
+    waiting = threading.Timer(_SLOW_S, logging.getLogger("sightline").info, [line])
+    waiting.daemon = True
+    usual_bytes = threading.stack_size(_STACK_BYTES)  # a robot locks its memory, including stacks
+    waiting.start()
+    threading.stack_size(usual_bytes)
+    try:
+        yield
+    finally:
+        waiting.cancel()
 
 
 def start_log(form: str | None, service: str) -> None:

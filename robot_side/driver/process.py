@@ -10,8 +10,8 @@ import struct
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack, suppress
 from functools import partial
 from types import FrameType
 from typing import Any, Final
@@ -27,6 +27,7 @@ from sightline.protocol.log import (
     faults,
     report_ending,
     report_fault,
+    slow_logged,
     start_log,
     start_log_thread,
 )
@@ -69,7 +70,6 @@ _MAX_CONFIG_BYTES = 1 << 20
 # The process locks its memory, including stacks of usually 8 MB. Plug-in code needs a larger stack than this code.
 _STACK_BYTES, _PLUGIN_STACK_BYTES = 256 * 1024, 1024 * 1024
 _BATTERY_PERIOD_S = 1.0
-_SLOW_S = 3.0
 _STOP_REPORT_US = 100_000
 _REOPENS_US = 1_000_000
 _INVALID: Final = (ValueError, KeyError, struct.error, WireError)
@@ -88,12 +88,12 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
     if not is_restart:
         check_ports(config.listen)  # before the devices: a second robot on these ports may own the devices, too
     with ExitStack() as last, ExitStack() as ending:
-        with _slow_logged(config, f"drive {config.motors.kind}"):
+        with slow_logged(f"robot {config.robot}: waiting for the drive {config.motors.kind} to open"):
             drive: Drive = LostDrive(config.motors) if is_restart else DRIVES.build(config.motors)
         ending.callback(_close, "drive", drive)
         ranges = None
         if config.ranging:
-            with _slow_logged(config, f"range sensor {config.ranging.kind}"):
+            with slow_logged(f"robot {config.robot}: waiting for the range sensor {config.ranging.kind} to open"):
                 ranges = RANGE_SENSORS.build(config.ranging)
             ending.callback(_close, "range sensor", ranges)
         threading.stack_size(_PLUGIN_STACK_BYTES)
@@ -114,20 +114,6 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
         # If it fails, the guardian does it.
         ending.callback(_end, config, drive, guardian)
         return driver.loop()
-
-
-@contextmanager
-def _slow_logged(config: RobotConfig, device: str) -> Iterator[None]:
-    """Log the name of a device that takes long to open: until all are open a robot is silent."""
-    waiting = threading.Timer(_SLOW_S, _log.info, ["robot %s: waiting for the %s to open", config.robot, device])
-    waiting.daemon = True
-    usual_bytes = threading.stack_size(_STACK_BYTES)
-    waiting.start()
-    threading.stack_size(usual_bytes)
-    try:
-        yield
-    finally:
-        waiting.cancel()
 
 
 class LostDrive:

@@ -112,7 +112,7 @@ def test_a_doubtful_encoder_is_counted_each_time_and_logged_ever_more_rarely(dri
     ("DRIVES", "drive log"), ("RANGE_SENSORS", "range sensor sim"), ("", None)])
 def test_a_device_that_takes_long_to_open_is_named_meanwhile(tmp_path, monkeypatch, caplog, slow, waiting):
     caplog.set_level("INFO")
-    monkeypatch.setattr(driver_process, "_SLOW_S", 0.02)
+    monkeypatch.setattr(log, "_SLOW_S", 0.02)
     monkeypatch.setattr(driver_process, "limit_core_dump", lambda: None)
     monkeypatch.setattr(driver_process, "check_ports", lambda _: None)
 

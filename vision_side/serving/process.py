@@ -14,6 +14,7 @@ from types import FrameType
 from typing import Final
 
 from sightline.protocol.errors import ConfigError
+from sightline.protocol.log import slow_logged
 from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
 from sightline.protocol.transports.link import Link
 from sightline.protocol.transports.security import date_problem
@@ -94,7 +95,6 @@ def _has_hanging_thread(until_s: float) -> bool:
     return any(one.is_alive() for one in others)
 
 
-_SLOW_S = 3.0
 _LOOK_S = 1.0  # time between two looks at the turns of the loop
 _PYTHON = str(Path(os.__file__).parent)
 
@@ -139,7 +139,9 @@ def run(config: VisionConfig, observe: Observe | None = None) -> int:
     from sightline.protocol.transports.flood_limits import limit_floods
 
     configured_mission(config)  # an unknown mission must fail before any endpoint is opened
-    ending, detector = threading.Event(), _loaded_detector(config)
+    ending = threading.Event()
+    with slow_logged(f"vision: waiting for the detector {config.detector.kind} to load"):
+        detector = configured_detector(config)
 
     def observed(state: ServingState) -> None:
         watch_turns(state, _log.warning)
@@ -155,17 +157,6 @@ def run(config: VisionConfig, observe: Observe | None = None) -> int:
                 return run_it(config, ending, observed, detector, guard)
         finally:
             close_detector(detector)
-
-
-def _loaded_detector(config: VisionConfig) -> Detector:
-    """Build the detector. Log its name after `_SLOW_S`, because until it is loaded the service is silent."""
-    waiting = threading.Timer(_SLOW_S, _log.info, ["vision: waiting for the detector %s to load", config.detector.kind])
-    waiting.daemon = True
-    waiting.start()
-    try:
-        return configured_detector(config)
-    finally:
-        waiting.cancel()
 
 
 def _run_one(

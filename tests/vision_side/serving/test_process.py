@@ -8,6 +8,7 @@ from contextlib import nullcontext
 
 import pytest
 
+from sightline.protocol import log
 from sightline.protocol.errors import ConfigError
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.serving import process
@@ -102,14 +103,17 @@ def test_detector_that_loads_slowly_is_named_until_it_is_loaded(monkeypatch, cap
         return "detector"
 
     caplog.set_level("INFO")
-    monkeypatch.setattr(process, "_SLOW_S", 0.01 if lines else 60.0)
+    monkeypatch.setattr(log, "_SLOW_S", 0.01 if lines else 60.0)
     monkeypatch.setattr(process, "configured_detector", build)
+    for name in ("configured_mission", "close_detector", "date_problem"):
+        monkeypatch.setattr(process, name, lambda *_: "")
+    monkeypatch.setattr(process, "_run_one", lambda _config, _ending, _observe, detector, _guard: detector)
     made: list[threading.Timer] = []
     usual = threading.Timer
     monkeypatch.setattr(threading, "Timer", lambda *given: made.append(usual(*given)) or made[-1])
     config = VisionConfig(detector=DetectorConfig(kind="hsv"))
     with pytest.raises(ConfigError) if error else nullcontext():
-        assert process._loaded_detector(config) == "detector"
+        assert process.run(config) == "detector"
     (waiting,) = made
     waiting.join(30)
     assert not waiting.is_alive()
