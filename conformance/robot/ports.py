@@ -269,6 +269,7 @@ def stops_by_datagram(bench: Bench, driver: Sender) -> None:
     """STOP by UDP while driving: STOPPED is reported within 300 ms, and the wheels are at zero within 700 ms."""
     robot = driver.robot
     with _stop_port(bench) as port:
+        port.learn_challenge()
         requested_us = robot.clock_us()
         port.send(port.datagram())
         port.stop_until_proven()

@@ -40,6 +40,15 @@ def test_stop_port_whose_secret_the_kit_lacks_is_not_a_failure(name, outcome):
     assert result.outcome is outcome, result.reason
 
 
+@pytest.mark.waits
+def test_stop_is_timed_from_its_datagram_while_the_kit_has_no_processor(monkeypatch):
+    with small_server(guarded=True) as (bench, prepare):
+        rest = bench.rest
+        monkeypatch.setattr(bench, "rest", lambda for_us: rest(for_us + 700_000 * (for_us == 20_000)))
+        [result] = run_cases([case for case in REAL if case.id == "R-STOP-23"], bench, prepare)
+    assert result.outcome is Outcome.PASSED, result.reason
+
+
 @pytest.mark.long
 def test_our_own_robot_passes(tmp_path):
     ends = [free_endpoint(scheme) for scheme in ("ws://", "ws-legacy://")]
