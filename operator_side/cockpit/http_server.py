@@ -188,7 +188,8 @@ class _Handler(BaseHTTPRequestHandler):
             return as_json({"error": "this page is for this machine only"}, 403)
         path = self.path.partition("?")[0]
         if method == "POST" and f"POST {path}" not in self.routes and f"GET {path}" in self.routes:
-            return replace(as_json({"error": f"{path} is only for GET, not for POST"}, 405), headers={"Allow": "GET, HEAD"})
+            why = as_json({"error": f"{path} is only for GET, not for POST"}, 405)
+            return replace(why, headers={"Allow": "GET, HEAD"})
         if method == "POST" and (self.headers.get("Origin", f"http://{host}") != f"http://{host}"
                                  or self.headers.get("Content-Type") != "application/json"):
             return as_json({"error": "the request is not from the page itself"}, 403)
