@@ -27,7 +27,7 @@ from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.preflight import needs
 from sightline.operator_side.table import print_table
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.log import error_text, start_log
+from sightline.protocol.log import error_text, slow_logged, start_log
 from sightline.protocol.transports.tokens import LEAST_WEIGHT, MOST_WEIGHT
 
 if TYPE_CHECKING:
@@ -221,7 +221,8 @@ def check(
     own, made = own_options(sets or ()), list["Detector"]()
 
     def make() -> "Detector":
-        made.append(build_detector(name, own, settings))
+        with slow_logged(f"waiting for the detector {name} to load"):
+            made.append(build_detector(name, own, settings))
         return made[-1]
 
     with plugin_prints(as_json):

@@ -1,9 +1,11 @@
 """The contract kit: our own detectors keep every promise, and each broken one is found out by the promise it breaks."""
 
 import threading
+import time
 import traceback
 from collections.abc import Sequence
 from dataclasses import replace
+from random import Random
 
 import pytest
 
@@ -12,7 +14,7 @@ from sightline.protocol.messages import MAX_DETECTED_BOXES
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect import contract
 from sightline.vision_side.detect.color.detectors import Hsv
-from sightline.vision_side.detect.contract import check_detector
+from sightline.vision_side.detect.contract import LOAD_S, MOST_S, check_detector
 from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, TrackIds
 from sightline.vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Detection, DetectionResult
 from sightline.vision_side.detect.registry import build_detector
@@ -129,8 +131,6 @@ class Inventing(Broken):
 
 class Slow(Broken):
     def detect(self, frames, deadline_us):
-        import time
-
         if deadline_us != NO_DEADLINE:
             time.sleep(0.3)
         return super().detect(frames, deadline_us)
@@ -207,7 +207,7 @@ def test_author_sees_the_line_that_raises(caplog) -> None:
 
 @pytest.mark.parametrize("place", ["__init__", "detect", "close"])
 def test_detector_that_hangs_breaks_the_promise_and_ends_the_check(monkeypatch, place: str) -> None:
-    monkeypatch.setattr(contract, "MOST_S", 0.05)
+    monkeypatch.setattr(contract, "LOAD_S" if place == "__init__" else "MOST_S", 0.05)
     left, began = threading.Event(), []
 
     def hang(*_given: object) -> None:
@@ -215,9 +215,49 @@ def test_detector_that_hangs_breaks_the_promise_and_ends_the_check(monkeypatch, 
         left.wait(30)
 
     (result,) = check_detector(type("Hanging", (Broken,), {place: hang}), 3)
-    assert (result.name, result.wrong) == ("order", "it takes more than 0.05 s; the rest was not checked")
+    what = "loading it" if place == "__init__" else "it"
+    assert (result.name, result.wrong) == ("order", f"{what} takes more than 0.05 s; the rest was not checked")
     assert until(lambda: began == [place])
     left.set()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_time_to_load_is_apart_from_the_time_of_the_promise(monkeypatch, seed: int) -> None:
+    """Before, a model that loads for two minutes was one that hangs."""
+    random, now_s, used_s = Random(seed), [1e6 * seed], 0.0
+    monkeypatch.setattr(contract.time, "monotonic", lambda: now_s[0])
+
+    def load() -> Broken:
+        assert loading.is_now and loading.until_s - now_s[0] == pytest.approx(LOAD_S)
+        now_s[0] += random.uniform(0, LOAD_S)
+        return Broken()
+
+    loading = contract._Loading(load)
+    assert loading.is_now and loading.until_s - now_s[0] == pytest.approx(LOAD_S)
+    for _ in range(4):
+        loading()
+        assert not loading.is_now and loading.until_s - now_s[0] == pytest.approx(MOST_S - used_s)
+        step_s = random.uniform(0, MOST_S / 4)
+        now_s[0] += step_s
+        used_s += step_s
+
+
+@pytest.mark.parametrize("calls", [1, 2, 16])
+def test_time_of_detect_counts_also_after_a_second_detector_has_loaded(monkeypatch, calls: int) -> None:
+    monkeypatch.setattr(contract, "_CHECKS", (contract._keeps_robots_apart,))
+    monkeypatch.setattr(contract, "MOST_S", 0.1)
+    left, count = threading.Event(), []
+
+    class Hanging:
+        def detect(self, frames, _deadline_us):
+            count.append(1)
+            if len(count) >= calls:
+                left.wait(5)
+            return [Inventing.empty(frame) for frame in frames]
+
+    (result,) = check_detector(Hanging, 3)
+    left.set()
+    assert result.wrong == "it takes more than 0.1 s; the rest was not checked"
 
 
 @pytest.mark.parametrize("error", [
