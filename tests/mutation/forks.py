@@ -20,7 +20,17 @@ from types import CodeType, FunctionType
 import pytest
 
 from tests.mutation.mutants import Mutant, Name
-from tests.mutation.trial import OPTIONS, Outcome, demand_not_imported, finish, fork, install, module_name, silence
+from tests.mutation.trial import (
+    CPU_SECONDS,
+    OPTIONS,
+    Outcome,
+    demand_not_imported,
+    finish,
+    fork,
+    install,
+    module_name,
+    silence,
+)
 
 _ALL_CPU_SECONDS = 600
 _SLOT = 4
@@ -59,7 +69,8 @@ def _session(plugin: "_Forks", suites: Sequence[str]) -> tuple[list[str | None],
         if text := report.read():
             ends, order = json.loads(text)
             return ends, order
-    raise RuntimeError(f"the tests did not start: {' '.join(suites)}")
+    what = f"did not start, fail, or need more than {CPU_SECONDS // 4} s of CPU"
+    raise RuntimeError(f"the tests {what}: {' '.join(suites)}")
 
 
 class _Forks:
@@ -146,7 +157,10 @@ class _Collected(_Forks):
             def note(at: int, report: pytest.TestReport) -> None:
                 _set(durations_us, at, _get(durations_us, at) + int(report.duration * 1e6))
 
-            finish(fork(lambda: self._run(session, note)), time.monotonic())
+            # A quarter of the time of a trial, or a mutant that only computes more would count as killed.
+            unchanged = finish(fork(lambda: self._run(session, note), CPU_SECONDS // 4), time.monotonic())
+            if unchanged is not Outcome.SURVIVED:
+                raise RuntimeError(f"the unchanged tests {unchanged.value}")
             of_item = {item: _get(durations_us, at) for at, item in enumerate(self._items)}
             session.items.sort(key=of_item.__getitem__)
 

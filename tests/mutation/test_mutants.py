@@ -121,7 +121,28 @@ assert list(try_mutants(found, (), of_one, 2).values()).count(Outcome.SURVIVED) 
 try_mutants(found, (), ["tests/no_such_test.py"], 2)
 """
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert ran.stderr.endswith("RuntimeError: the tests did not start: tests/no_such_test.py\n"), ran.stderr
+    assert "the tests did not start, fail, or need more than 5 s of CPU: tests/no_such_test.py\n" in ran.stderr, ran.stderr
+
+
+@pytest.mark.parametrize(("test", "is_tried"), [("pass", True), ("assert False", False), ("while True: pass", False)])
+def test_tests_that_fail_or_take_long_try_no_mutant(tmp_path, test, is_tried):
+    """Before, each mutant then counted as killed by the time limit."""
+    head = "from sightline.vision_side.serving import assignment\ndef test_it():\n    "
+    (tmp_path / "test_it.py").write_text(head + test)
+    code = """
+import sys
+from pathlib import Path
+from tests.mutation import forks
+from tests.mutation.mutants import mutants
+forks.CPU_SECONDS = 4
+file = "vision_side/serving/assignment.py"
+found = list(mutants(file, Path(file).read_text()))[:1]
+print(*(end.value for end in forks.try_mutants(found, (), [sys.argv[1]], 1).values()))
+"""
+    command = [sys.executable, "-c", code, tmp_path / "test_it.py"]
+    ran = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (ran.stdout == "survived\n") is is_tried
+    assert ("RuntimeError: the tests did not start, fail, or need more than 1 s of CPU" in ran.stderr) is not is_tried
 
 
 def test_part_of_a_file_has_the_mutants_of_its_names_and_constants_only(tmp_path, monkeypatch):

@@ -21,9 +21,9 @@ import numpy  # noqa: F401
 # All children share what is loaded here. It imports no file that has mutants, or no mutant of that file would run.
 import sightline.protocol.messages  # noqa: F401
 
-# A table takes well under one second of CPU. The bounds end a mutant that loops or allocates without end.
-_CPU_SECONDS = 5
-_WALL_SECONDS = 60.0
+# A table takes about one second of CPU. The bounds end a mutant that loops or allocates without end.
+CPU_SECONDS = 20
+_WALL_SECONDS = 120.0
 _MEMORY_BYTES = 4 << 30
 OPTIONS = ("-q", "--tb=no", "--assert=plain", "-p", "no:cacheprovider", "-p", "no:hypothesispytest")
 """Options of pytest in each child."""
@@ -67,7 +67,7 @@ def demand_not_imported(file: str) -> None:
         raise RuntimeError(f"{file} was imported before its mutants; find its importer in this process")
 
 
-def fork(work: Callable[[], int], cpu_seconds: int = _CPU_SECONDS) -> int:
+def fork(work: Callable[[], int], cpu_seconds: int = CPU_SECONDS) -> int:
     """Fork a child that exits with the result of `work`; return its pid."""
     pid = os.fork()
     if pid:
