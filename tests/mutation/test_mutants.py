@@ -121,7 +121,7 @@ assert list(try_mutants(found, (), of_one, 2).values()).count(Outcome.SURVIVED) 
 try_mutants(found, (), ["tests/no_such_test.py"], 2)
 """
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert "the tests did not start, fail, or need more than 5 s of CPU: tests/no_such_test.py\n" in ran.stderr, ran.stderr
+    assert "fail, or need more than 5 s of CPU: tests/no_such_test.py\n" in ran.stderr, ran.stderr
 
 
 @pytest.mark.parametrize(("test", "is_tried"), [("pass", True), ("assert False", False), ("while True: pass", False)])

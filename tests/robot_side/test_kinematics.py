@@ -350,7 +350,7 @@ def test_a_jump_is_what_twice_the_fastest_wheel_could_not_turn(max_rad_s, read_s
 
 
 def wheel(*looks, max_rad_s=10.0):
-    """What the monitor of one wheel finds at each (commanded rad, angle rad, time of the reading us, now us)."""
+    """Return what the monitor of one wheel finds at each (commanded rad, angle rad, time of the reading us, now us)."""
     monitor = WheelMonitor(max_rad_s)
     return [(monitor.look(*look), monitor.jumped) for look in looks]
 
