@@ -8,7 +8,7 @@ import queue
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
@@ -26,7 +26,15 @@ from sightline.protocol.messages import MAX_DETECTED_BOXES, FrameHeader
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.onnx.self_test import difference
 from sightline.vision_side.detect.plugin_calls import annotation_problem, close_detector, labels_of
-from sightline.vision_side.detect.port import NO_DEADLINE, NORMALIZED_PX, DetectFrame, DetectionResult, Detector
+from sightline.vision_side.detect.port import (
+    NO_DEADLINE,
+    NORMALIZED_PX,
+    DetectFrame,
+    DetectionResult,
+    Detector,
+    corners,
+    overlap,
+)
 
 SIZES: Final = ((320, 240), (640, 480), (97, 61), (16, 16), (1280, 720), (641, 481))
 LATE_S: Final = 0.25
@@ -40,6 +48,9 @@ _MAX_PIXELS: Final = 1920 * 1080
 _FRAME_US: Final = 33_333
 _QUALITY: Final = 80
 _HASH = re.compile(r"[0-9a-f]{0,64}")
+_BALL_BGR: Final = 13, 199, 242
+_PLACES: Final = ((0.3, 0.7), (0.7, 0.3), (0.75, 0.75))
+"""Centers of a ball, as shares of width and height. Exchanged coordinates or half the scale name a place outside it."""
 _SAME_SCORE: Final = 0.5  # on a device that rounds, less certain detections may come and go
 
 Make = Callable[[], Detector]
@@ -186,6 +197,33 @@ def _keeps_bounds(detector: Detector, _make: Make, seed: int) -> str:
     return "all boxes lie within two pixels of the corner, as if from 0 to 1" if 0 < furthest_px < NORMALIZED_PX else ""
 
 
+def _keeps_places(detector: Detector, _make: Make, _seed: int) -> str:
+    """Boxes lie where the object is, in images of any size."""
+    for size in SIZES[:2]:
+        missed = [wrong for place in _PLACES if (wrong := _misplaced(detector, size, place)) is not None]
+        if len(missed) > 1 and all(missed):  # a detector of other objects may find something else once
+            return missed[0]
+    return ""
+
+
+def _misplaced(detector: Detector, size: tuple[int, int], place: tuple[float, float]) -> str | None:
+    """Show a gray image, then a ball in it. Return None if the ball causes no box, "" for a box on the ball."""
+    x_px, y_px, radius_px = round(place[0] * size[0]), round(place[1] * size[1]), size[1] // 10
+    picture = np.full((size[1], size[0], 3), 120, np.uint8)
+    empty = _encoded(picture)
+    cv2.circle(picture, (x_px, y_px), radius_px, _BALL_BGR, -1, cv2.LINE_AA)
+    jpegs = (empty, *[_encoded(picture)] * 2)  # a detector may need a second image to be sure
+    before, *_, after = (one.detections if one else () for one in _seen(detector, _frames(jpegs, size, f"r{x_px}")))
+    if before or not after:
+        return None
+    ball = x_px - radius_px, y_px - radius_px, x_px + radius_px, y_px + radius_px
+    if any(overlap(corners(one), ball) for one in after):
+        return ""
+    box = ", ".join(f"{side:g}" for side in corners(after[0]))
+    return (f"a box {box} for a ball at {x_px}, {y_px} in {size[0]}x{size[1]}; expected x1, y1, x2, y2 in pixels "
+            "of the encoded image")
+
+
 def _keeps_silence(detector: Detector, _make: Make, seed: int) -> str:
     """Bytes that are not an image get no answer, and the next frame gets its own."""
     good = list(drawn_frames(seed, 2, SIZES[0]))
@@ -251,8 +289,8 @@ def _keeps_its_name(detector: Detector, _make: Make, seed: int) -> str:
     return ""
 
 
-_CHECKS: Final = (_keeps_order, _keeps_answering, _keeps_bounds, _keeps_silence, _keeps_deadline, _keeps_the_same,
-                  _keeps_robots_apart, _keeps_its_name)
+_CHECKS: Final = (_keeps_order, _keeps_answering, _keeps_bounds, _keeps_places, _keeps_silence, _keeps_deadline,
+                  _keeps_the_same, _keeps_robots_apart, _keeps_its_name)
 
 
 # --- frames and comparisons ------------------------------------------------------------------------------------------
@@ -301,7 +339,11 @@ def _is_bad(frame: DetectFrame) -> bool:
 
 def drawn_frames(seed: int, count: int, size: tuple[int, int], robot: str = "r1") -> Iterator[DetectFrame]:
     """Draw frames of one robot, 33 ms apart, each with a separate decoder, so that all stay valid."""
-    for index, jpeg in enumerate(_jpegs(seed, count, size)):
+    return _frames(_jpegs(seed, count, size), size, robot)
+
+
+def _frames(jpegs: Iterable[bytes], size: tuple[int, int], robot: str) -> Iterator[DetectFrame]:
+    for index, jpeg in enumerate(jpegs):
         header = FrameHeader(session="0000abcd", seq=index + 1, t_us=5_000_000 + index * _FRAME_US)
         yield DetectFrame(robot, header, jpeg, Decoder(*size, _MAX_PIXELS))
 
@@ -317,9 +359,13 @@ def _jpeg(random: Random, size: tuple[int, int], index: int = 0) -> bytes:
     if index % 4 == 1:
         picture = np.random.default_rng(random.randrange(2**31)).integers(0, 256, picture.shape, np.uint8)
     if index % 4 != 3:
-        _draw(picture, random, (13, 199, 242))
+        _draw(picture, random, _BALL_BGR)
     for _ in range(random.randrange(4)):
         _draw(picture, random, tuple(random.randrange(256) for _ in range(3)))
+    return _encoded(picture)
+
+
+def _encoded(picture: np.ndarray) -> bytes:
     return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1])
 
 

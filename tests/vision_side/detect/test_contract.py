@@ -3,7 +3,7 @@
 import threading
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from random import Random
 
@@ -16,7 +16,7 @@ from sightline.vision_side.detect import contract
 from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.contract import LOAD_S, MOST_S, check_detector
 from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, TrackIds
-from sightline.vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Detection, DetectionResult
+from sightline.vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Detection, DetectionResult, corners
 from sightline.vision_side.detect.registry import build_detector
 from sightline.vision_side.detect.remote.fallback import Fallback
 from sightline.vision_side.detect.shadow import ShadowDetector
@@ -187,6 +187,62 @@ class Halved(Broken):
 )
 def test_broken_detector_fails_the_promise_that_it_breaks(broken: type[Broken], promise: str) -> None:
     assert promise in {one.name for one in check_detector(broken, 3) if one.wrong}
+
+
+def moved(change: Callable[[Detection, DetectionResult], tuple[float, ...]]) -> type[Broken]:
+    """Return the color detector whose boxes have the corners of `change`."""
+
+    class Moved(Broken):
+        def detect(self, frames, deadline_us):
+            return [one and replace(one, detections=tuple(self.box(found, one) for found in one.detections))
+                    for one in super().detect(frames, deadline_us)]
+
+        @staticmethod
+        def box(found: Detection, result: DetectionResult) -> Detection:
+            return Detection(*change(found, result), found.score, found.label)
+
+    return Moved
+
+
+ELSEWHERE = Detection(1.0, 1.0, 9.0, 10.0, 0.9, "target")
+
+
+def promises_broken(make: type[Broken], monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    monkeypatch.setattr(contract, "_CHECKS", (contract._keeps_places,))
+    return {one.name for one in check_detector(make, 3) if one.wrong}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda one, _: (one.y1_px, one.x1_px, one.y2_px, one.x2_px),
+     lambda one, of: (of.width_px - one.x2_px, one.y1_px, of.width_px - one.x1_px, one.y2_px),
+     lambda one, of: (one.x1_px, of.height_px - one.y2_px, one.x2_px, of.height_px - one.y1_px),
+     lambda one, of: tuple(side / (1 + (of.width_px == 640)) for side in corners(one)),
+     lambda one, of: tuple(side * of.width_px / 640 for side in corners(one))],
+    ids=["y before x", "mirrored", "from the bottom", "pixels of the half scale", "pixels of another input"],
+)
+def test_boxes_beside_their_object_break_the_promise(change, monkeypatch) -> None:
+    assert promises_broken(moved(change), monkeypatch) == {"places"}
+
+
+@pytest.mark.parametrize(
+    "found",
+    [lambda one, _seen: one, lambda one, seen: (*one, ELSEWHERE)[: 2 * (seen % 3)],
+     lambda _one, seen: (ELSEWHERE,) * (seen == 5), lambda _one, _seen: (ELSEWHERE,), lambda _one, _seen: ()],
+    ids=["all", "other things, too", "once another thing", "always another thing", "nothing"],
+)
+def test_detector_of_other_objects_keeps_the_promise_of_places(found, monkeypatch) -> None:
+    class Other(Broken):
+        def detect(self, frames, deadline_us):
+            return [one and replace(one, detections=found(one.detections, self.calls))
+                    for one in super().detect(frames, deadline_us)]
+
+    assert not promises_broken(Other, monkeypatch)
+
+
+def test_box_on_a_part_of_its_object_keeps_the_promise(monkeypatch) -> None:
+    top = moved(lambda one, _: (one.x1_px + 2, max(0.0, one.y1_px - 2), one.x2_px - 2, one.y1_px + 2))
+    assert not promises_broken(top, monkeypatch)
 
 
 @pytest.mark.parametrize("furthest_px", [2.0, 9.0])
