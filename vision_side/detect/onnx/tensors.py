@@ -127,7 +127,11 @@ def _shape_text(one: Tensor) -> str:
 
 def _kind(outputs: Sequence[Tensor], labels: Sequence[str]) -> tuple[str, int, int]:
     """Return the kind, its number of classes (0 if unknown), and the numbers of a mask in each row."""
-    if {one.name for one in outputs} >= _TRIPLE:
+    is_triple = {one.name for one in outputs} >= _TRIPLE
+    for one in outputs:
+        if "int8" in one.type and (one.name in ("boxes", "scores") or not is_triple):
+            raise ValueError(f"its output {one.name} is {one.type}, which is quantized; export it with float outputs")
+    if is_triple:
         return "triple", 0, 0
     masks = next((one.shape[1] or 0 for one in outputs if _is_prototypes(one)), 0)
     rows = [one for one in outputs if not _is_prototypes(one)]

@@ -190,8 +190,9 @@ def _detection(
     across, down = stretch
     x1, y1, x2, y2 = (float(value) for value in box)
     if x2 < x1 or y2 < y1 or score > 1:
-        corners = f"{x1:g} {y1:g} {x2:g} {y2:g}"
-        raise NoAnswerError(NoAnswerReason.MALFORMED, f"a box inside out or a score over 1: {corners}, {score:g}")
+        corners = f"{x1:g}, {y1:g}, {x2:g}, {y2:g}"
+        raise NoAnswerError(NoAnswerReason.MALFORMED, f"a box {corners} with the score {score:g}; expected x1, y1, x2, "
+                                                      "y2 and a score from 0 to 1")
     one = Detection(x1 * across, y1 * down, x2 * across, y2 * down, score, clean_label(label))
     return clipped(one, *size_px)
 

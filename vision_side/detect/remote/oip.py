@@ -110,6 +110,9 @@ def model_of(name: str, version: str, inputs: Sequence[TensorSlot], outputs: Seq
     missing = {BOXES, SCORES} - given
     if missing:
         raise _unfit(name, f"it gives {', '.join(sorted(given)) or 'nothing'}; {' and '.join(sorted(missing))} missing")
+    for slot in outputs:
+        if slot.name in (BOXES, SCORES) and slot.datatype in ("INT8", "UINT8"):
+            raise _unfit(name, f"its {slot.name} are {slot.datatype}, which is quantized; float expected")
     wanted = (BOXES, SCORES, LABELS) if LABELS in given else (BOXES, SCORES)
     return OipModel(name, version, one, wanted)
 

@@ -62,6 +62,23 @@ def test_model_with_other_outputs_is_rejected(shapes: list, words: str) -> None:
         form_of(*shapes)
 
 
+@pytest.mark.parametrize("kind", ["tensor(int8)", "uint8"])
+@pytest.mark.parametrize(
+    "outputs",
+    [{"boxes": (5, 4), "scores": (5,), "labels": (5,)}, {"output0": (1, 84, 8400)}, {"output0": (1, 300, 6)}],
+)
+def test_quantized_boxes_and_scores_are_rejected_and_labels_of_bytes_are_not(outputs: dict, kind: str) -> None:
+    """Before, a byte of 1 was a score of 1, and int8 scores, which may be below 0, were "saw nothing"."""
+    for quantized in outputs:
+        header = OnnxHeader((INPUT,), tuple(Tensor(name, kind if name == quantized else "float32", shape)
+                                            for name, shape in outputs.items()), {})
+        if quantized == "labels":
+            assert model_format(header, (), "auto").kind == "triple"
+            continue
+        with pytest.raises(ValueError, match=r"its output .* is .*int8.*, which is quantized"):
+            model_format(header, (), "auto")
+
+
 @pytest.mark.parametrize("shape", [(1, 3, None, 320), (1, 3, 320, None)])
 def test_model_with_one_open_side_is_rejected(shape: tuple[int | None, ...]) -> None:
     """Its warm-up may have the right size, and an image of the robot another one."""

@@ -3,7 +3,7 @@
 import contextlib
 import json
 import random
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -60,6 +60,8 @@ def test_metadata_defines_the_request():
     ([PIXELS], [], "boxes and scores missing"), ([TensorSlot("image", "UINT8", (240, 320))], OUTPUTS, "not an image"),
     ([TensorSlot("image", "UINT8", (1, 240, 320, 4))], OUTPUTS, "not an image"),
     ([TensorSlot("image", "BYTES", (1, 1, 1))], OUTPUTS, "not one JPEG"),
+    *[([PIXELS], [replace(one, datatype=kind) if one.name == name else one for one in OUTPUTS], f"{name} are {kind}, ")
+      for name in ("boxes", "scores") for kind in ("INT8", "UINT8")],
 ])  # fmt: skip
 def test_model_that_does_not_fit_gives_a_readable_error(inputs, outputs, why):
     with pytest.raises(NoAnswerError, match=why) as error:
