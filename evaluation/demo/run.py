@@ -33,7 +33,7 @@ from sightline.sim.bus import TruthReader
 from sightline.sim.scenario import Scenario, load_scenario
 from sightline.sim.toml_file import laid_over
 from sightline.sim.truth import Truth
-from sightline.vision_side.detect.registry import BOXES, check_choice
+from sightline.vision_side.detect.registry import BOXES, check_choice, check_takes_pictures
 from sightline.vision_side.missions.registry import configured_mission
 
 
@@ -163,6 +163,7 @@ def _check_vision(options: DemoOptions, scenario: Scenario) -> None:
     if kind == BOXES:
         raise ConfigError(f"--detector {BOXES}: no service publishes boxes in {scenario.name}; choose a local one, "
                           "e.g. hsv")
+    check_takes_pictures(kind)
     check_choice(kind, {}, config)
 
 

@@ -25,7 +25,7 @@ from sightline.evaluation.score.figures import (
 from sightline.evaluation.score.sabotage import HEALTHY, SABOTAGES, reason_of
 from sightline.protocol.errors import ConfigError
 from sightline.sim.scenario import FIGURES, Scenario, load_scenario, look_named, scenario_names
-from sightline.vision_side.detect.registry import check_choice
+from sightline.vision_side.detect.registry import check_choice, check_takes_pictures
 from sightline.vision_side.missions.registry import REGISTRY, configured_mission
 
 Result = TypeVar("Result")
@@ -123,6 +123,7 @@ def cases(
             fix = f"choose with --scenario what {mission} can drive" if mission else "correct its mission or options"
             raise ConfigError(f"scenario {name}: {error}{given}; {fix}") from None
         if detector is not None:
+            check_takes_pictures(detector)
             check_choice(detector, {}, config)
     if look is not None:
         look_named(look)

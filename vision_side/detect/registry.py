@@ -119,8 +119,8 @@ def _check_fallback(config: VisionConfig) -> None:
 def check_takes_pictures(kind: str) -> None:
     """Raise ConfigError for a detector that only receives boxes of a robot's frames, for a run without a robot."""
     if kind != BOXES and getattr(REGISTRY.load(split_kind(kind)[0]), "only_receives", False):
-        raise ConfigError(f"detector {kind!r} receives boxes of a robot's own frames, and there is no robot here; "
-                          "name the detector that the service serves")
+        raise ConfigError(f"detector {kind!r} receives boxes of a robot's own frames, and its service serves no "
+                          "robot here; name the detector that the service serves")
 
 
 def check_device(config: VisionConfig) -> None:

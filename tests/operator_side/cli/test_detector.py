@@ -205,6 +205,8 @@ def test_a_model_is_checked_with_its_options(capsys, tmp_path: Path) -> None:
         (("demo", "--mission", "folow", "--out", "/nowhere/made"), 2, "did you mean 'follow'"),
         (("demo", "--mission", "goto", "--out", "/nowhere/made"), 2, "waypoints"),
         (("demo", "--detector", "boxes", "--out", "/nowhere/made"), 2, "no service publishes boxes in circle"),
+        (("demo", "--detector", "zenoh", "--out", "/nowhere/made"), 2, "that the service serves"),
+        (("score", "--scenario", "circle", "--detector", "zenoh"), 2, "that the service serves"),
     ],
 )
 def test_every_mistake_is_one_line(capsys, arguments: tuple[str, ...], code: int, words: str) -> None:
