@@ -252,6 +252,8 @@ def _replay_line(replayed: Replayed, fix: str) -> str:
     if replayed.gaps or replayed.missing_frames:
         lost = f"{replayed.gaps} answers and {replayed.missing_frames} frames are not in the recording"
         return f"replay: cannot be compared, for {lost}; {fix}"
+    if replayed.has_fallback and replayed.equal < replayed.total:
+        return "replay: cannot be compared, because the time decides whether the detector or its fallback answers"
     return f"replay: {replayed.equal} of {replayed.total} answers equal byte for byte"
 
 

@@ -66,6 +66,8 @@ class Replayed:
     gaps: int = 0
     """Number of answers, and of cited scans and missions, that are not in the recording."""
     first_difference: str = ""
+    has_fallback: bool = False
+    """True if a fallback answered what came late. The same frame may be in time now, or late."""
 
     @property
     def ok(self) -> bool:
@@ -89,7 +91,7 @@ def replay(path: Path, on_step: Callable[[Step], None] = lambda _step: None) -> 
     """Replay the recording at `path`; call `on_step` for each answered frame. Raises ConfigError for another file."""
     answers = _answers(path)
     missing = _gather_cited(path, answers)
-    result = Replayed(gaps=answers.gaps + missing)
+    result = Replayed(gaps=answers.gaps + missing, has_fallback=bool(_vision_config(path).detector.fallback))
     for step in _steps(path, answers):
         on_step(step)
         result.total += 1

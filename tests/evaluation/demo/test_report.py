@@ -153,6 +153,17 @@ def test_summary_names_how_to_record_the_missing_messages(lights, dropped, loss,
                     f"not in the recording; {fix}")
 
 
+@pytest.mark.parametrize(("equal", "has_fallback", "line"), [
+    (9, False, "9 of 9 answers equal byte for byte"), (9, True, "9 of 9 answers equal byte for byte"),
+    (3, False, "3 of 9 answers equal byte for byte"),
+    (3, True, "cannot be compared, because the time decides whether the detector or its fallback answers"),
+])
+def test_summary_compares_no_answers_that_depend_on_the_time(lights, equal, has_fallback, line):
+    replayed = Replayed(total=9, equal=equal, has_fallback=has_fallback)
+    lines = demo_report.summary(demo_report.DemoReport(lights, None, [], replayed, None))
+    assert [one for one in lines if one.startswith("replay: ")] == [f"replay: {line}"]
+
+
 def test_summary_shows_what_the_detector_reported_each_line_once_and_the_first_three(lights):
     judged = demo_report.report(lights)
     before = demo_report.summary(judged)

@@ -108,6 +108,16 @@ class Remote(Hsv):
         return [None] * len(frames) if Remote.late else super().detect(frames, deadline_us)
 
 
+@pytest.mark.parametrize("fallback", ["", "hsv"])
+def test_replay_shows_that_a_fallback_may_have_answered(tmp_path, fallback):
+    detector = DetectorConfig(kind="hsv", fallback=fallback, deadline_s=1.0)
+    path, config = tmp_path / "run.mcap", GOTO.model_copy(update={"detector": detector, "mission": MissionConfig()})
+    bench = Bench(config=GOTO)
+    with Recorder(bench.network.link("r1"), path, {VISION_CONFIG: config.model_dump_json()}):
+        show_camera(bench, MODEL)
+    assert replay(path).has_fallback is bool(fallback)
+
+
 @pytest.mark.parametrize("late", [1, 2, 7])
 def test_frame_of_a_late_remote_detector_is_acknowledged_again(monkeypatch, tmp_path, late):
     detector = DetectorConfig(kind=f"{__name__}:Remote", deadline_s=1.0)
