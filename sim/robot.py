@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from sightline.protocol.config import Config
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import CameraModel
-from sightline.sim.toml_file import check, find, is_file, read_table
+from sightline.sim.toml_file import check, find, is_file, names_in, read_table
 from sightline.sim.urdf import Front, Outline, Transform, Urdf, urdf_text
 
 ROBOTS = Path(__file__).parent / "robots"
@@ -163,6 +163,11 @@ class RobotModel(Config):
         if bool(self.urdf) == bool(self.chassis and self.caster) or (self.urdf and (self.chassis or self.caster)):
             raise ValueError("a body is either a urdf, or a chassis and a caster")
         return self
+
+
+def robot_names() -> list[str]:
+    """Return the names of the robots that come with Sightline."""
+    return names_in(ROBOTS)
 
 
 def load_robot(name: str) -> RobotModel:

@@ -112,6 +112,8 @@ def cli_page() -> str:
     root = typer.main.get_command(app)
     parts = [NOTE, "# Command line\n",
              "This page lists each command with its options. `sightline COMMAND --help` prints the same text. "
+             "After `sightline --install-completion`, the Tab key completes commands, options and names in a new "
+             "terminal. "
              "[Exit codes](exit-codes.md) are the same for all commands.\n"]
     heading = ""
     for name, command in commands(root, "sightline"):

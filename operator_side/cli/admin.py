@@ -197,7 +197,9 @@ def show(folder: Folder, as_json: Json = False) -> None:
 
 
 def install(
-    service: Annotated[str, typer.Argument(metavar="robot|vision", help="Service to install.")],
+    service: Annotated[
+        str, typer.Argument(metavar="robot|vision", autocompletion=lambda: units.SERVICES, help="Service to install.")
+    ],
     config: Annotated[
         Path | None,
         typer.Option("--config", metavar="FILE", help="Its configuration [default: /etc/sightline/SERVICE.toml]."),

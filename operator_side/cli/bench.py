@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sightline.operator_side.cli.options import Json, command_group, numbers, print_result
+from sightline.operator_side.cli.options import Json, ScenarioNames, command_group, numbers, print_result
 from sightline.operator_side.preflight import needs
 from sightline.operator_side.table import table_lines
 from sightline.protocol.errors import ConfigError
@@ -95,7 +95,7 @@ def pipeline(*, as_json: Json = False) -> int:
 
 def demo(
     *,
-    scenario: Annotated[str, typer.Option(help="`all`, or names separated by commas.")] = "all",
+    scenario: ScenarioNames = "all",
     seeds: Annotated[str, typer.Option(help="Seeds, separated by commas.")] = "201,202,203",
     seconds: Annotated[
         float | None, typer.Option(min=5, max=3600, help="Length of each demo [default: 20, or of the course].")

@@ -24,6 +24,7 @@ from sightline.operator_side.cli.options import (
     Connect,
     Json,
     Port,
+    Robot,
     RobotName,
     Secure,
     ServiceConnect,
@@ -368,9 +369,7 @@ _PAGE_S = 0.3  # time for the page to fetch the result
 
 
 def pick_color(
-    robot: Annotated[
-        str | None, typer.Argument(metavar="ROBOT", help="Robot of the images [default: of `sightline use`, or r1].")
-    ] = None,
+    robot: Robot = None,
     *,
     picture: Annotated[
         Path | None, typer.Option("--image", "--picture", metavar="FILE", help="Use an image file.")

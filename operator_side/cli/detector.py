@@ -20,6 +20,7 @@ from sightline.operator_side.cli.options import (
     MaybeSecure,
     ServiceConnect,
     Sets,
+    complete_detector,
     plugin_prints,
     print_result,
 )
@@ -81,7 +82,11 @@ def register(app: typer.Typer) -> None:
 def serve(
     context: typer.Context,
     *,
-    name: Annotated[str, typer.Option("--serve", metavar="NAME", help="Detect for every robot that it reaches.")] = "",
+    name: Annotated[
+        str,
+        typer.Option("--serve", metavar="NAME", autocompletion=complete_detector,
+                     help="Detect for every robot that it reaches."),
+    ] = "",
     robot: Robots = None,
     listen: Listen = None,
     connect: ServiceConnect = None,
@@ -197,7 +202,10 @@ def _problem(registry: "PluginRegistry", name: str) -> str:
 
 
 def check(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="hsv, onnx:PATH, package.module:Name ...")],
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", autocompletion=complete_detector,
+                            help="hsv, onnx:PATH, package.module:Name ..."),
+    ],
     *,
     sets: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="An option of the detector's own Config.")

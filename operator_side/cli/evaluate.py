@@ -12,7 +12,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from sightline.operator_side.cli.options import ConfigFile, Device, Json, Sets, numbers, plugin_prints, print_result
+from sightline.operator_side.cli.options import (
+    ConfigFile,
+    DetectorName,
+    Device,
+    Json,
+    ScenarioNames,
+    Sets,
+    complete_detector,
+    complete_mission,
+    complete_robot_model,
+    complete_scenario,
+    numbers,
+    plugin_prints,
+    print_result,
+)
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.preflight import needs
 from sightline.operator_side.table import print_table
@@ -44,13 +58,18 @@ def register(app: typer.Typer) -> None:
     app.command(epilog="Example: sightline train --out runs/train")(train)
 
 
+MissionName = Annotated[
+    str | None, typer.Option("--mission", autocompletion=complete_mission, help="Mission [default: of the scenario].")
+]
+
+
 def demo(
     *,
-    scenario: Annotated[str, typer.Option(help="A name from `sightline scenarios`, or a .toml file.")] = "circle",
-    mission: Annotated[str | None, typer.Option(help="Mission [default: of the scenario].")] = None,
-    detector: Annotated[
-        str | None, typer.Option(help="Detector, see `sightline detector list` [default: auto].")
-    ] = None,
+    scenario: Annotated[
+        str, typer.Option(autocompletion=complete_scenario, help="A name from `sightline scenarios`, or a .toml file.")
+    ] = "circle",
+    mission: MissionName = None,
+    detector: DetectorName = None,
     seconds: Annotated[
         float | None, typer.Option(help="Length; 0 runs until Ctrl-C [default: 20, or the length of the course].")
     ] = None,
@@ -127,17 +146,22 @@ def _to_stderr(line: str) -> None:
 def score(
     context: typer.Context,
     *,
-    scenario: Annotated[str, typer.Option(help="`all`, or names separated by commas.")] = "all",
+    scenario: ScenarioNames = "all",
     seeds: Annotated[str, typer.Option(help="Seeds, separated by commas; use seeds without tuning on them.")] = "1,2,3",
     latency_ms: Annotated[str, typer.Option(help="Added latencies in ms, separated by commas.")] = "50",
     loss: Annotated[str, typer.Option(help="Losses on each leg, separated by commas.")] = "0.1",
     seconds: Annotated[
         float | None, typer.Option(min=1, max=3600, help="Length of a run [default: of the scenario].")
     ] = None,
-    mission: Annotated[str | None, typer.Option(help="Mission [default: of the scenario].")] = None,
-    robot_model: Annotated[str | None, typer.Option(help="Robot model [default: of the scenario].")] = None,
+    mission: MissionName = None,
+    robot_model: Annotated[
+        str | None, typer.Option(autocompletion=complete_robot_model, help="Robot model [default: of the scenario].")
+    ] = None,
     look: Annotated[str | None, typer.Option(help="Light, e.g. dim [default: of the scenario].")] = None,
-    detector: Annotated[str | None, typer.Option(help="Detector, e.g. onnx [default: of the scenario].")] = None,
+    detector: Annotated[
+        str | None,
+        typer.Option(autocompletion=complete_detector, help="Detector, e.g. onnx [default: of the scenario]."),
+    ] = None,
     sabotage: Annotated[
         list[str] | None, typer.Option(help="Break one part, e.g. wheels-dead, or `all`; each run must fail.")
     ] = None,
@@ -184,7 +208,9 @@ FROM = 900_000
 
 def detectors(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="NAME", help="See `sightline detector list` [default: hsv onnx].")
+        list[str] | None,
+        typer.Argument(metavar="NAME", autocompletion=complete_detector,
+                       help="See `sightline detector list` [default: hsv onnx]."),
     ] = None,
     *,
     frames: Annotated[

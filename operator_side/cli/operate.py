@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from sightline.operator_side.cli.app import send_stop
-from sightline.operator_side.cli.options import CHECK_FAILED, Connect, Json, Robot, Secure
+from sightline.operator_side.cli.options import (
+    CHECK_FAILED,
+    Connect,
+    Json,
+    Robot,
+    Secure,
+    complete_mission,
+    complete_robot,
+)
 from sightline.operator_side.client.requests import SOURCE, Operator
 from sightline.operator_side.client.status import reply_line, short_lines, status_lines
 from sightline.operator_side.config.context import RobotAddress, stop_secret_of, target_of
@@ -218,7 +226,9 @@ Label = Annotated[str, typer.Option("--label", metavar="LABEL", help="Label to f
 def mission(
     robot: Robot = None,
     name: Annotated[
-        str | None, typer.Argument(metavar="NAME", help="Mission to start; without it, show the mission.")
+        str | None,
+        typer.Argument(metavar="NAME", autocompletion=complete_mission,
+                       help="Mission to start; without it, show the mission."),
     ] = None,
     *,
     label: Label = "",
@@ -249,7 +259,7 @@ def mission(
 
 
 def goto(
-    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="Robot id.")],
+    robot: Annotated[str, typer.Argument(metavar="ROBOT", autocompletion=complete_robot, help="Robot id.")],
     numbers: Annotated[
         list[str] | None, typer.Argument(metavar="X Y [X Y ...]", help="Waypoints in meters, in the odometry frame.")
     ] = None,

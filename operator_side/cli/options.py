@@ -5,18 +5,49 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from typing import Annotated, Any, Final, TypeVar
 
 import typer
 
+from sightline.operator_side.config.context import find_address
+from sightline.protocol.config import PluginRegistry
 from sightline.protocol.errors import CheckError, ConfigError
 
 CHECK_FAILED: Final = CheckError.exit_code
 """Exit code: a check failed, or the robot rejected the request."""
 
+# What a shell completes. These functions import no plug-in and open no link.
+complete_camera, complete_detector, complete_mission = (
+    PluginRegistry(kind, f"sightline.{kind}s").names for kind in ("camera", "detector", "mission")
+)
+
+
+def complete_scenario() -> list[str]:
+    """Return the names of the scenarios."""
+    from sightline.sim.scenario import scenario_names
+
+    return scenario_names()
+
+
+def complete_robot_model() -> list[str]:
+    """Return the names of the simulated robots."""
+    from sightline.sim.robot import robot_names
+
+    return robot_names()
+
+
+def complete_robot() -> list[str]:
+    """Return the robot of `sightline use`, or the default. Returns no robot if a saved or given address is invalid."""
+    with suppress(ConfigError):
+        return [find_address(os.environ, None, None).robot]
+    return []
+
+
 Robot = Annotated[
-    str | None, typer.Argument(metavar="ROBOT", help="Robot id [default: the one of `sightline use`, or r1].")
+    str | None,
+    typer.Argument(metavar="ROBOT", autocompletion=complete_robot,
+                   help="Robot id [default: the one of `sightline use`, or r1]."),
 ]
 
 Connect = Annotated[
@@ -74,7 +105,19 @@ Port = Annotated[
 Device = Annotated[str | None, typer.Option("--device", help="auto, cpu, cuda or tensorrt [default: auto].")]
 
 CameraKind = Annotated[
-    str | None, typer.Option("--camera", metavar="KIND", help="A camera of this machine: v4l2, picamera, video ...")
+    str | None,
+    typer.Option("--camera", metavar="KIND", autocompletion=complete_camera,
+                 help="A camera of this machine: v4l2, picamera, video ..."),
+]
+
+ScenarioNames = Annotated[
+    str, typer.Option("--scenario", autocompletion=complete_scenario, help="`all`, or names separated by commas.")
+]
+
+DetectorName = Annotated[
+    str | None,
+    typer.Option("--detector", metavar="NAME", autocompletion=complete_detector,
+                 help="Detector, see `sightline detector list` [default: auto]."),
 ]
 
 CameraSets = Annotated[

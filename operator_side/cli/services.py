@@ -17,6 +17,7 @@ from sightline.operator_side.cli.options import (
     CameraSets,
     ConfigFile,
     Connect,
+    DetectorName,
     Device,
     Json,
     Listen,
@@ -30,9 +31,14 @@ from sightline.operator_side.cli.options import (
     SocketDir,
     check_camera_sets,
     command_group,
+    complete_detector,
+    complete_mission,
+    complete_robot,
+    complete_robot_model,
+    complete_scenario,
 )
 from sightline.operator_side.config.context import target_of
-from sightline.operator_side.config.loading import load_service, model_of
+from sightline.operator_side.config.loading import SERVICES, load_service, model_of
 from sightline.operator_side.config.toml_text import toml_text
 from sightline.operator_side.preflight import needs
 from sightline.operator_side.table import print_table
@@ -76,11 +82,14 @@ Weight = Annotated[
 def sim(
     *,
     scenario: Annotated[
-        str | None, typer.Option(help="A name from `sightline scenarios`, or a .toml file [default: circle].")
+        str | None,
+        typer.Option(autocompletion=complete_scenario,
+                     help="A name from `sightline scenarios`, or a .toml file [default: circle]."),
     ] = None,
     robot_model: Annotated[
         str | None,
-        typer.Option(help="raspberry, gazebo-raspi, thymio, chaser, chaser-small, or a .toml [default: scenario's]."),
+        typer.Option(autocompletion=complete_robot_model,
+                     help="raspberry, gazebo-raspi, thymio, chaser, chaser-small, or a .toml [default: scenario's]."),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the start and the noise.")] = None,
     motor_log: Annotated[
@@ -169,16 +178,16 @@ def vision(
     secure: MaybeSecure = None,
     config: ConfigFile = None,
     sets: Sets = None,
-    detector: Annotated[
-        str | None,
-        typer.Option("--detector", metavar="NAME", help="Detector, see `sightline detector list` [default: auto]."),
-    ] = None,
+    detector: DetectorName = None,
     device: Device = None,
     shadow: Annotated[
-        str | None, typer.Option("--shadow", metavar="NAME", help="A second detector, which never steers.")
+        str | None,
+        typer.Option("--shadow", metavar="NAME", autocompletion=complete_detector,
+                     help="A second detector, which never steers."),
     ] = None,
     mission: Annotated[
-        str | None, typer.Option("--mission", metavar="NAME", help="Mission [default: follow].")
+        str | None,
+        typer.Option("--mission", metavar="NAME", autocompletion=complete_mission, help="Mission [default: follow]."),
     ] = None,
     share: Share = False,
     name: ShareName = None,
@@ -280,7 +289,10 @@ def _ends(endpoints: list[str] | None) -> tuple[str, ...] | None:
 
 
 def scenarios(
-    name: Annotated[str | None, typer.Argument(metavar="NAME", help="A scenario, or a .toml file.")] = None,
+    name: Annotated[
+        str | None,
+        typer.Argument(metavar="NAME", autocompletion=complete_scenario, help="A scenario, or a .toml file."),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write sim.toml, robot.toml and vision.toml there.")
     ] = None,
@@ -358,7 +370,7 @@ def _write(out: Path, name: str, files: dict[str, dict[str, Any]]) -> None:
 
 
 def labels(
-    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="Robot id.")] = "r1",
+    robot: Annotated[str, typer.Argument(metavar="ROBOT", autocompletion=complete_robot, help="Robot id.")] = "r1",
     connect: ServiceConnect = None,
     secure: Secure = "",
     socket_dir: SocketDir = None,
@@ -378,7 +390,9 @@ def labels(
 # --- `config check | show | schema` ------------------------------------------------------------------------------
 
 
-ServiceName = Annotated[str, typer.Argument(metavar="SERVICE", help="robot, vision or sim.")]
+ServiceName = Annotated[
+    str, typer.Argument(metavar="SERVICE", autocompletion=lambda: SERVICES, help="robot, vision or sim.")
+]
 File = Annotated[str | None, typer.Argument(metavar="FILE", help="TOML file of the service.")]
 Profile = Annotated[str | None, typer.Option(help="Profile below the file, e.g. sim.")]
 

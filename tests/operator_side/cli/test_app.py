@@ -148,18 +148,6 @@ def test_group_without_a_subcommand_lists_its_subcommands(capsys, group):
         assert re.search(rf"^  {name} ", out, re.MULTILINE), name
 
 
-def test_completion_of_the_shell_offers_commands_and_options():
-    def offered(words):
-        environ = {**os.environ, "_SIGHTLINE_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": "1"}
-        script = "from sightline.operator_side.cli.app import main; main()"
-        command = [sys.executable, "-P", "-c", script]
-        done = subprocess.run(command, env=environ, capture_output=True, text=True, check=True)
-        return done.stdout.split()
-
-    assert set(offered("sightline st")) == {"status", "stop"}
-    assert "--version" in offered("sightline --")
-
-
 _INTERRUPTED = """
 import signal, sys
 from importlib import import_module
@@ -458,16 +446,6 @@ def test_full_temporary_folders_are_one_line(capsys, monkeypatch, tmp_path, argu
     assert (code, err.splitlines()[-1]) == (2, (
         "error: no temporary folder can be written: the disk is full or read-only; free some space, or set TMPDIR to "
         "a folder that you may write"))
-
-
-@pytest.mark.parametrize("home", ["file", "/proc/absent"])
-def test_completion_in_a_home_that_cannot_be_written_is_one_line(tmp_path, home):
-    (tmp_path / "file").touch()
-    command = [sys.executable, "-m", "sightline.operator_side.cli.app", "--install-completion"]
-    environ = os.environ | {"HOME": str(tmp_path / home), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
-    done = subprocess.run([*command, "bash"], capture_output=True, text=True, env=environ, check=False)
-    assert done.returncode == 2
-    assert re.fullmatch(rf"error: cannot write {tmp_path / home}.*: .*; set HOME to a folder .*\n", done.stderr)
 
 
 @pytest.mark.parametrize("as_json", [True, False])
