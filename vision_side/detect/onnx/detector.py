@@ -442,7 +442,7 @@ def _bytes_of(path: Path) -> bytes:
             raise ConfigError("this copy of Sightline has no model; name one, e.g. --detector onnx:ball.onnx, or "
                               "train it (docs/explanation/learned-detector.md)") from None
         why = error.strerror or "it cannot be read"
-        raise ConfigError(f"model {path}: {why}; name a model file, e.g. --detector onnx:ball.onnx") from None
+        raise ConfigError(f"model {path}: {why}; check the path, and that you may read it") from None
 
 
 def _least(given: float | None, header: OnnxHeader) -> float:
