@@ -27,6 +27,8 @@ _MAX_ROWS: Final = 100_000
 _MAX_OVERLAP: Final = 0.5
 _GRAY: Final = 114  # border next to an image that does not fill the input, as in the training of YOLO
 _STEP_PX: Final = 32  # an open input size is rounded up to a multiple of this
+_STRIDES: Final = (8, 16, 32)
+"""Sizes of the cells of YOLO in px. Since version 8 each cell gives one box, in YOLOv5 three."""
 _TRIPLE: Final = {"boxes", "scores", "labels"}
 _SUPPRESSED: Final = 1000
 """With more rows, six numbers are one class of YOLOv5. With fewer, they are boxes without overlaps."""
@@ -94,7 +96,7 @@ def model_format(header: OnnxHeader, names: Sequence[str], color: str) -> ModelF
         raise ValueError(f"its input is {_shape_text(one)}; export it with both H and W fixed, or with both open")
     size = (rows, columns) if rows and columns else None
     labels = named_labels(names) or own_labels(header.metadata)
-    kind, classes, masks = _kind(header.outputs, labels)
+    kind, classes, masks = _kind(header.outputs, labels, size)
     if not labels and classes == len(COCO):
         labels = COCO
     batched = size is not None and one.shape[0] is None and all(_is_for_several(one, kind) for one in header.outputs)
@@ -125,7 +127,9 @@ def _shape_text(one: Tensor) -> str:
     return "(" + ", ".join("?" if part is None else str(part) for part in one.shape) + ")"
 
 
-def _kind(outputs: Sequence[Tensor], labels: Sequence[str]) -> tuple[str, int, int]:
+def _kind(
+    outputs: Sequence[Tensor], labels: Sequence[str], size: tuple[int, int] | None
+) -> tuple[str, int, int]:
     """Return the kind, its number of classes (0 if unknown), and the numbers of a mask in each row."""
     is_triple = {one.name for one in outputs} >= _TRIPLE
     for one in outputs:
@@ -139,7 +143,7 @@ def _kind(outputs: Sequence[Tensor], labels: Sequence[str]) -> tuple[str, int, i
     if shape and shape[-1] == 6 + masks and (len(shape) < 2 or (shape[-2] or 0) <= _SUPPRESSED):
         return "rows", 0, masks
     if len(shape) == 3:
-        by_row = _is_by_row(shape, len(labels), masks)
+        by_row = _is_by_row(shape, len(labels), masks, size)
         classes = (shape[2] or 0) - 5 - masks if by_row else (shape[1] or 0) - 4 - masks
         if classes > 0 and labels and classes != len(labels):
             raise ValueError(f"it has {classes} classes and {len(labels)} names; "
@@ -151,12 +155,15 @@ def _kind(outputs: Sequence[Tensor], labels: Sequence[str]) -> tuple[str, int, i
                      "(1, 4 + classes, N), or one (1, N, 5 + classes)")
 
 
-def _is_by_row(shape: Sequence[int | None], labels: int, masks: int) -> bool:
-    """Return True if each row is a box: by the number of labels, otherwise because boxes outnumber classes."""
+def _is_by_row(shape: Sequence[int | None], labels: int, masks: int, size: tuple[int, int] | None) -> bool:
+    """Return True if each row is a box: by the number of labels, or of boxes, or because these outnumber classes."""
     if labels and shape[1] == 4 + labels + masks:
         return False
     if labels and shape[2] == 5 + labels + masks:
         return True
+    cells = sum((size[0] // stride) * (size[1] // stride) for stride in _STRIDES) if size else -1
+    if (shape[2] == cells) != (shape[1] == 3 * cells):
+        return shape[2] != cells
     return shape[1] is None or (shape[2] is not None and shape[2] < shape[1])
 
 

@@ -87,6 +87,18 @@ def test_model_with_one_open_side_is_rejected(shape: tuple[int | None, ...]) -> 
         model_format(header, (), "auto")
 
 
+@pytest.mark.parametrize("side", range(32, 673, 64))
+@pytest.mark.parametrize("classes", [1, 80, 365, 601, 996])
+def test_number_of_boxes_identifies_the_head_of_a_model_without_names(side: int, classes: int) -> None:
+    """A small input may have fewer boxes than classes: (1, 605, 525) was read as YOLOv5 with 520 classes."""
+    boxes = sum((side // stride) ** 2 for stride in (8, 16, 32))
+    image = Tensor("images", "float32", (1, 3, side, side))
+    for kind, shape in ("yolo", (1, 4 + classes, boxes)), ("yolov5", (1, 3 * boxes, 5 + classes)):
+        if shape[-1] != 6:
+            form = model_format(OnnxHeader((image,), (Tensor("output0", "float32", shape),), {}), (), "auto")
+            assert (form.kind, form.labels == COCO) == (kind, classes == 80)
+
+
 def test_number_of_names_must_match_the_classes() -> None:
     for shape in ((1, 84, 8400), (1, 25200, 85)):
         with pytest.raises(ValueError, match="80 classes and 2 names"):
