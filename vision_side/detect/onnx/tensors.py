@@ -174,8 +174,10 @@ def own_labels(metadata: Mapping[str, str]) -> tuple[str, ...]:
             found = json.loads(metadata["labels"])
         else:
             names = ast.literal_eval(metadata.get("names", "{}"))
+            if isinstance(names, dict):  # a number without a name is its own label
+                names = [names.get(number, number) for number in range(min(max(names, default=-1), _MAX_LABELS) + 1)]
             found = [names[index] for index in range(len(names))]
-    except (ValueError, SyntaxError, KeyError, TypeError, RecursionError, MemoryError):
+    except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError):
         raise ValueError("its metadata names no labels: `labels` is a JSON list of words") from None
     if not isinstance(found, list) or len(found) > _MAX_LABELS:
         raise ValueError(f"its metadata names no labels: `labels` is a JSON list of at most {_MAX_LABELS} words")

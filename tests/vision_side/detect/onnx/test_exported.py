@@ -99,6 +99,21 @@ def test_number_of_boxes_identifies_the_head_of_a_model_without_names(side: int,
             assert (form.kind, form.labels == COCO) == (kind, classes == 80)
 
 
+@pytest.mark.parametrize("names", ["{1: 'cup', 3: 'plate'}", "{3: 'plate', 1: 'cup'}"])
+def test_number_without_a_name_is_the_label_of_its_class(names: str) -> None:
+    assert form_of((1, 300, 6), metadata=names).labels == ("0", "cup", "2", "plate")
+    assert form_of((1, 8, 8400), metadata=names).kind == "yolo"
+
+
+@pytest.mark.parametrize("names", [
+    "{10**9: 'cup'}", "{1000000000: 'cup'}", "{'0': 'cup'}", "{0.5: 'cup'}", "7", "{'cup'}", "{(): 'cup'}",
+    "{None: 'cup', 0: 'plate'}",
+])
+def test_names_that_do_not_number_classes_are_one_line(names: str) -> None:
+    with pytest.raises(ValueError, match="its metadata names no labels"):
+        form_of((1, 300, 6), metadata=names)
+
+
 def test_number_of_names_must_match_the_classes() -> None:
     for shape in ((1, 84, 8400), (1, 25200, 85)):
         with pytest.raises(ValueError, match="80 classes and 2 names"):
