@@ -34,7 +34,7 @@ def check_robot_id(robot: str) -> str:
     if not ROBOT_ID.fullmatch(robot):
         raise ConfigError(
             f"invalid robot id {robot!r}: expected 1 to 32 letters, digits, '_', '-' or '.', starting with a letter or "
-            "digit (no '/' or '*'), e.g. --robot r1"
+            f"digit (no '/' or '*'), e.g. r1{'; pass an address with --connect' if {*'/:'} <= {*robot} else ''}"
         )
     return robot
 

@@ -302,6 +302,8 @@ def test_command_whose_standard_streams_are_closed_has_the_null_device_and_so_ha
         (["score", "--detector", "hvs"], 2, "'hsv'"),
         (["status", "--connect", "here"], 2, "tcp/127.0.0.1:7447"),
         (["arm", "a b"], 2, "'a b'"),
+        *(([command, "tcp/127.0.0.1:9"], 2, "(no '/' or '*'), e.g. r1; pass an address with --connect")
+          for command in ("arm", "stop", "status", "mission", "watch")),
         (["arm", ""], 2, "invalid robot id ''"),
         (["arm", "", "--connect", "tcp/127.0.0.1:9"], 2, "invalid robot id ''"),
         *((words, 2, "no home folder for '~no-user' in ~no-user/x; write the whole path") for words in (
