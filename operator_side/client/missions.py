@@ -40,7 +40,7 @@ def waypoints_of(texts: Sequence[str]) -> Waypoints:
     numbers = [_number(text, f"waypoint {at // 2 + 1}") for at, text in enumerate(texts)]
     if len(numbers) % 2:
         raise ConfigError(f"waypoint {len(numbers) // 2 + 1}: has an X and no Y; write X Y [X Y ...] in meters")
-    return _counted(tuple(zip(numbers[::2], numbers[1::2], strict=True)))
+    return _counted(tuple(zip(numbers[::2], numbers[1::2], strict=True)), "", "e.g. sightline goto r1 1.5 1.5")
 
 
 def waypoints_of_file(text: str, name: str) -> Waypoints:
@@ -53,22 +53,26 @@ def waypoints_of_file(text: str, name: str) -> Waypoints:
         if len(parts) != 2:
             raise ConfigError(f"{name}:{number}: has {len(parts)} numbers; write X Y in meters, one waypoint per line")
         found.append((_number(parts[0], f"{name}:{number}"), _number(parts[1], f"{name}:{number}")))
-    return _counted(tuple(found))
+    return _counted(tuple(found), f"{name}: ", "one X Y per line")
 
 
 def _number(text: str, where: str) -> float:
     if not _NUMBER.fullmatch(text):
-        hint = f"; write {text.replace(',', '.')}" if _NUMBER.fullmatch(text.replace(",", ".")) else ""
-        raise ConfigError(f"{where}: invalid number '{text}'{hint}")
+        fix = "write X Y in meters, e.g. 1.5 -0.5"
+        if text.startswith("-"):
+            fix = "`sightline goto --help` lists the options"
+        if _NUMBER.fullmatch(text.replace(",", ".")):
+            fix = f"write {text.replace(',', '.')}"
+        raise ConfigError(f"{where}: invalid number '{text}'; {fix}")
     value = float(text)
     if not abs(value) <= MAX_WAYPOINT_M:
         raise ConfigError(f"{where}: {text} m is out of range; expected {-MAX_WAYPOINT_M:g} to {MAX_WAYPOINT_M:g} m")
     return value
 
 
-def _counted(found: Waypoints) -> Waypoints:
+def _counted(found: Waypoints, where: str, form: str) -> Waypoints:
     if not 1 <= len(found) <= MAX_WAYPOINTS:
-        raise ConfigError(f"{len(found)} waypoints; expected 1 to {MAX_WAYPOINTS}, e.g. sightline goto r1 1.5 1.5")
+        raise ConfigError(f"{where}{len(found)} waypoints; expected 1 to {MAX_WAYPOINTS}, {form}")
     return found
 
 

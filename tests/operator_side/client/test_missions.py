@@ -26,12 +26,12 @@ def test_waypoints_are_pairs_of_meters():
 
 
 @pytest.mark.parametrize(("texts", "words"), [
-    (["1", "2", "abc", "4"], "waypoint 2: invalid number 'abc'"),
+    (["1", "2", "abc", "4"], "waypoint 2: invalid number 'abc'; write X Y in meters, e.g. 1.5 -0.5"),
     (["1", "nan"], "waypoint 1: invalid number 'nan'"),
     (["inf", "1"], "waypoint 1: invalid number 'inf'"),
     (["1_0", "1"], "waypoint 1: invalid number '1_0'"),
     (["٣", "1"], "invalid number"),
-    (["1", "2", "--wiat"], "waypoint 2: invalid number '--wiat'"),
+    (["1", "2", "--wiat"], "waypoint 2: invalid number '--wiat'; `sightline goto --help` lists the options"),
     (["1", "2", "3"], "waypoint 2: has an X and no Y"),
     (["1", "100.5"], "waypoint 1: 100.5 m is out of range; expected -100 to 100 m"),
     (["1e999", "1"], "out of range"),
@@ -47,7 +47,7 @@ def test_invalid_waypoint_is_named(texts, words):
 @pytest.mark.parametrize(("text", "words"), [
     ("1 2\n1 2 3\n", "way.txt:2: has 3 numbers"),
     ("1 2\n1 b\n", "way.txt:2: invalid number 'b'"),
-    ("# nothing\n", "0 waypoints"),
+    ("# nothing\n", "way.txt: 0 waypoints; expected 1 to 64, one X Y per line"),
     ("1 500\n", "way.txt:1: 500 m is out of range"),
 ])
 def test_a_file_of_waypoints_names_its_line(text, words):
