@@ -79,6 +79,8 @@ def first_problem(error: ValidationError, noun: str = "", known: Iterable[str] =
     if first["type"] == "missing":
         return f"{noun or 'key'} {place!r} is missing"
     what = first["msg"].removeprefix("Value error, ")
+    if first["type"] in ("model_type", "dict_type"):  # the message of pydantic names the class
+        what = "expected a table"
     if not place:
         return what
     return f"{noun} {place!r}: {what}" if noun else f"{place}: {what}"

@@ -138,6 +138,8 @@ def _problem(model: type[BaseModel], key: Key, problem: Any) -> str:
     if problem["type"] == "value_error":
         return f": {problem['ctx']['error']}"
     may_be = allowed(model, key)
+    if may_be and problem["type"].endswith(("_type", "_parsing")):  # the message of pydantic names Python types
+        return f" = {_shown(problem['input'])}: expected {may_be}"
     message = problem["msg"].replace("Input should be", "expected", 1)
     return f" = {_shown(problem['input'])}: {message}" + (f"; allowed: {may_be}" if may_be else "")
 

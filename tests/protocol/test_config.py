@@ -12,9 +12,14 @@ from sightline.protocol.errors import ConfigError
 CAMERAS = PluginRegistry("camera", "sightline.cameras")
 
 
+class Mount(Config):
+    height_m: float = 0.0
+
+
 class Lens(Config):
     focal_px: float = Field(gt=0)
     name: str = "lens"
+    mount: Mount = Mount()
 
 
 def problem_of(given, *arguments):
@@ -25,7 +30,9 @@ def problem_of(given, *arguments):
 
 @pytest.mark.parametrize(("given", "as_option", "plain"), [
     ({}, "option 'focal_px' is missing", "key 'focal_px' is missing"),
-    ({"focal": 3}, "unknown option 'focal'; it takes focal_px, name", "unknown key 'focal'; it takes focal_px, name"),
+    ({"focal": 3}, "unknown option 'focal'; it takes focal_px, name, mount",
+     "unknown key 'focal'; it takes focal_px, name, mount"),
+    ({"focal_px": 3, "mount": 3}, "option 'mount': expected a table", "mount: expected a table"),
     ({"focal_px": -1}, "option 'focal_px': Input should be greater than 0", "focal_px: Input should be greater than 0"),
 ])
 def test_the_first_problem_is_one_line(given, as_option, plain):

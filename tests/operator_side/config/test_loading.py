@@ -1,13 +1,16 @@
 """Settings: precedence, origins, and every mistake as one line that names it."""
 
+import re
 import tomllib
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
-from sightline.operator_side.config.errors import is_known, known_keys
+from sightline.operator_side.config.errors import is_known, known_keys, table_of
 from sightline.operator_side.config.loading import ENV_PREFIX, SERVICES, load, load_service, model_of
 from sightline.operator_side.config.toml_text import toml_text
 from sightline.protocol.errors import ConfigError
@@ -88,7 +91,7 @@ def test_misspelled_environment_name_is_rejected_with_the_nearest(name):
         ("safety.auto_arm=7", ["--set safety.auto_arm", "7", "true or false"]),
         ("safety.max_linear_mp=1", ["unknown key", "'safety.max_linear_mps'"]),
         ("max_linear_mps=1", ["unknown key", "'safety.max_linear_mps'"]),
-        ("camera=3", ["--set camera", "3", "a table"]),
+        ("camera=3", ["--set camera = 3: expected a table"]),
         ("listen=nowhere", ["'nowhere'", "tcp/127.0.0.1:7447"]),
         ("listen=tcp/127.0.0.1:99999", ["99999", "65535"]),
         ("robot=a/b", ["'a/b'", "letters"]),
@@ -101,6 +104,21 @@ def test_invalid_value_is_one_line_with_the_permitted_values(setting, expected):
         load("robot", sets=[setting], environ={})
     for part in expected:
         assert part in one_line(error)
+
+
+@pytest.mark.parametrize("service", SERVICES)
+def test_value_in_place_of_another_type_names_no_code(service):
+    """A table was "a valid dictionary or instance of SafetyConfig", a list "a valid tuple"."""
+    for key, field in model_of(service).model_fields.items():
+        for value in (3, {"no": {"such": "value"}}):
+            with suppress(ValidationError):
+                model_of(service).model_validate({key: value})
+                continue
+            with pytest.raises(ConfigError) as error:
+                load(service, options={key: value}, environ={})
+            assert not re.search("dictionary|instance|tuple|Config|valid s", one_line(error)), key
+            if table_of(field.annotation) and value == 3:
+                assert one_line(error).endswith(" = 3: expected a table"), key
 
 
 def test_several_errors_are_shown_as_the_first_and_a_count(tmp_path):
