@@ -192,6 +192,8 @@ class MissionClient:
 
     def _silence(self) -> str:
         robot = self._link.robot
+        if self._report is None and self.operator.report is None:
+            return f"no status from robot '{robot}' after {PATIENCE_S:g} s; run `sightline robots`"
         if self._report is None:
             return f"no report from a vision service of robot '{robot}' after {PATIENCE_S:g} s; run `sightline vision`"
         now = f"{self._report.mission}: {self._report.phase}"

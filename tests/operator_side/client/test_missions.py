@@ -6,6 +6,7 @@ import pytest
 
 from sightline.operator_side.cli import operate
 from sightline.operator_side.client.missions import (
+    MissionClient,
     cannot,
     mission_line,
     mission_lines,
@@ -14,8 +15,11 @@ from sightline.operator_side.client.missions import (
     waypoints_of_file,
 )
 from sightline.operator_side.config.toml_text import options_of
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.messages import MissionReport
+from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.driver.core import DriverCore
 
 
 def test_waypoints_are_pairs_of_meters():
@@ -99,6 +103,22 @@ def test_request_that_the_protocol_does_not_permit_is_rejected(name, options, wo
 def test_waypoints_that_the_protocol_does_not_permit_are_named(wrong):
     with pytest.raises(ConfigError, match=r"invalid waypoints: expected at most 64 pairs \(x, y\), each number -"):
         request_of(1, "goto", wrong, {})
+
+
+def test_silence_names_the_side_that_is_silent():
+    """`sightline mission follow` names a robot 'follow'. Before, it advised to run a vision service."""
+    network = MemoryNetwork()
+    missions = MissionClient(network.link("r1", role="operator"))
+    with pytest.raises(LinkError, match="no status from robot 'r1' after 3 s; run `sightline robots`"):
+        missions.report(0.0)
+    driving = DriverCore(RobotConfig(drive=PluginChoice(kind="log"), camera=PluginChoice(kind="folder")), "0000000a")
+    now_us = network.now_us + 1_000_000
+    driving.tick(now_us, None, None)
+    for message in driving.messages(now_us):
+        network.link("r1").publish(message.channel, message.header, message.payload)
+    network.advance(now_us)
+    with pytest.raises(LinkError, match="no report from a vision service of robot 'r1' after 3 s; run `sightline vis"):
+        missions.report(0.0)
 
 
 def test_report_is_formatted_as_text():
