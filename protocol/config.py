@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 PLUGIN_ERRORS: Final = (Exception, SystemExit)
 """Errors of plug-in code. A `sys.exit` in a plug-in must end only the plug-in, not the service."""
 _LONGEST_DETAIL: Final = 160
+_TYPE_NAMES: Final = {"model_type": "a table", "dict_type": "a table", "tuple_type": "a list", "list_type": "a list",
+                      "string_type": "text"}
+"""Type of a pydantic error -> the term in TOML, because the messages of pydantic name Python types and classes."""
 _log: Final = logging.getLogger(__name__)
 _HERE: Final = Path(__file__).resolve().parent
 _CLASS: Final = re.compile(r"[^\W\d][\w.]*:[^\W\d]\w*")
@@ -78,9 +81,8 @@ def first_problem(error: ValidationError, noun: str = "", known: Iterable[str] =
         return f"unknown {noun or 'key'} {place!r}; it takes {', '.join(known) or 'none'}"
     if first["type"] == "missing":
         return f"{noun or 'key'} {place!r} is missing"
-    what = first["msg"].removeprefix("Value error, ")
-    if first["type"] in ("model_type", "dict_type"):  # the message of pydantic names the class
-        what = "expected a table"
+    type_name = _TYPE_NAMES.get(first["type"])
+    what = f"expected {type_name}" if type_name else first["msg"].removeprefix("Value error, ")
     if not place:
         return what
     return f"{noun} {place!r}: {what}" if noun else f"{place}: {what}"

@@ -20,6 +20,7 @@ class Lens(Config):
     focal_px: float = Field(gt=0)
     name: str = "lens"
     mount: Mount = Mount()
+    range_m: tuple[float, ...] = ()
 
 
 def problem_of(given, *arguments):
@@ -30,8 +31,10 @@ def problem_of(given, *arguments):
 
 @pytest.mark.parametrize(("given", "as_option", "plain"), [
     ({}, "option 'focal_px' is missing", "key 'focal_px' is missing"),
-    ({"focal": 3}, "unknown option 'focal'; it takes focal_px, name, mount",
-     "unknown key 'focal'; it takes focal_px, name, mount"),
+    ({"focal": 3}, "unknown option 'focal'; it takes focal_px, name, mount, range_m",
+     "unknown key 'focal'; it takes focal_px, name, mount, range_m"),
+    ({"focal_px": 3, "name": 3}, "option 'name': expected text", "name: expected text"),
+    ({"focal_px": 3, "range_m": 3}, "option 'range_m': expected a list", "range_m: expected a list"),
     ({"focal_px": 3, "mount": 3}, "option 'mount': expected a table", "mount: expected a table"),
     ({"focal_px": -1}, "option 'focal_px': Input should be greater than 0", "focal_px: Input should be greater than 0"),
 ])
