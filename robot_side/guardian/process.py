@@ -245,7 +245,7 @@ class Guardian:
         schedule_real_time(GUARDIAN_PRIORITY)
         try:
             self._zero(self._zero_config)
-        except (Exception, SystemExit) as error:  # third-party code
+        except BaseException as error:  # third-party code; signals reach the main thread only
             failed.append(error)
 
     def _start_driver(self) -> None:

@@ -50,7 +50,7 @@ def _note_path() -> str:
 def main(arguments: list[str]) -> None:
     """Set the motors of the note to zero, or become the command `arguments`."""
     # Whatever is wrong with a note or a drive, the command reports it.
-    with suppress(Exception, SystemExit):
+    with suppress(BaseException):
         with open(_note_path(), encoding="utf-8") as file:  # noqa: PTH123
             note = json.load(file)
         sys.path[:] = note["path"]

@@ -31,6 +31,21 @@ from tests.fixtures.robot_process import RobotProcess, Vision, driving, stop_aft
 pytestmark = pytest.mark.waits
 
 MEMORY_KB = 15_000
+GUARDIAN_OF_A_DEAD_DRIVER = """
+import os, signal, socket
+from sightline.robot_side.guardian import process
+
+def zero(config):
+    raise {}("broken")
+
+driver = os.fork()
+if not driver:
+    signal.pause()
+os.kill(driver, signal.SIGKILL)
+near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+drive = dict(module="__main__", name="zero", config=dict())
+process.main(dict(zero=drive, path=[], robot="r1", driver=None, pid=driver, beats=near.detach(), receiver=None))
+"""
 BOUND_S, BOUND_M = 0.7, 0.25
 
 
@@ -106,6 +121,14 @@ def test_zero_that_fails_is_reported_and_the_next_driver_stops_the_wheels(dying,
     fault.zero_fails("")
     robot.process.terminate()
     assert robot.process.wait(START_S) == 0 and robot.output().count("NOT set to zero") == 1
+
+
+@pytest.mark.parametrize("error", ["SystemExit", "KeyboardInterrupt", "GeneratorExit", "OSError"])
+def test_zero_that_raises_anything_leaves_motors_that_are_not_set_to_zero(error):
+    command = [sys.executable, "-c", GUARDIAN_OF_A_DEAD_DRIVER.format(error)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=START_S, check=False)
+    assert f"motors NOT set to zero: {error}: broken; switch off their supply" in done.stderr
+    assert "motors are set to zero" not in done.stdout and done.returncode == 3
 
 
 def test_robot_whose_drive_is_gone_shows_why_and_drives_again_when_it_is_back(dying):

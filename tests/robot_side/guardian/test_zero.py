@@ -84,11 +84,17 @@ def leaves(_config):
     raise SystemExit(0)
 
 
+def interrupts(_config):
+    raise KeyboardInterrupt
+
+
 class Fallback(BaseException):
     """In place of the other command."""
 
 
-@pytest.mark.parametrize("broken", ["", "{", '{"path": []}', "[]", "raises", "leaves", "absent", "gone", "no folder"])
+@pytest.mark.parametrize("broken", [
+    "", "{", '{"path": []}', "[]", "raises", "leaves", "interrupts", "absent", "gone", "no folder",
+])
 def test_without_a_note_that_works_the_other_command_runs(folder, monkeypatch, broken):
     def execute(program, arguments):
         raise Fallback(program, arguments)
@@ -100,7 +106,7 @@ def test_without_a_note_that_works_the_other_command_runs(folder, monkeypatch, b
         file.unlink()
     elif broken == "no folder":
         monkeypatch.delenv("RUNTIME_DIRECTORY")
-    elif broken not in ("raises", "leaves", "absent"):
+    elif broken not in ("raises", "leaves", "interrupts", "absent"):
         file.write_text(broken)
     with pytest.raises(Fallback) as fallen:
         zero.main(COMMAND)
