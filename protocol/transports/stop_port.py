@@ -218,6 +218,8 @@ _UNREAD_BYTES: Final = 240
 """Two seconds of reports of a robot at rest. A running process reads each one immediately, also in a flood."""
 _MAX_BEHIND: Final = 5
 """Checks, a second after each other, that find so many unread bytes in the pipe of a stopped or hung process."""
+_START_CHECKS: Final = 30
+"""Such checks after a start, which may read its modules from a slow card."""
 _CHILD: Final = (
     "import sys; top = type(sys)('sightline'); top.__path__ = [sys.argv.pop(1)]; sys.modules['sightline'] = top; "
     "from sightline.{} import main; main()"
@@ -247,7 +249,7 @@ class StopProcess:
         self._behind = 0
 
     def keep_alive(self, at_us: int) -> None:
-        """Start the process if it does not run, at most once a second. A stopped or hung one is killed first."""
+        """Start the process if it does not run, at most once a second. One that reads no packets is killed first."""
         if at_us < self._start_at_us:
             return
         self._start_at_us = at_us + _RESTART_US
@@ -264,7 +266,7 @@ class StopProcess:
                 logging.getLogger(__name__).error(
                     "STOP %s ended (%s); starting it again", self.module.rpartition("_")[2],
                     "stopped or hung" if self._behind >= _MAX_BEHIND else self._process.poll())
-            self._behind = 0
+            self._behind = _MAX_BEHIND - _START_CHECKS
             root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))  # noqa: PTH100, PTH120
             number = self.far.fileno()
             command = [sys.executable, "-I", "-S", "-c", _CHILD.format(self.module), root, str(number)]

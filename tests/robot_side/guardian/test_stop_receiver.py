@@ -226,6 +226,37 @@ def test_receiver_that_is_late_but_reads_is_left_alone(started, operator, caplog
     assert process._process is running and running.poll() is None and not caplog.messages
 
 
+class Unread:
+    """A process that does not read."""
+
+    pid, returncode = 1, None
+
+    def poll(self):
+        return self.returncode
+
+    def kill(self):
+        self.returncode = -signal.SIGKILL
+
+    wait = poll
+
+
+def test_start_that_takes_half_a_minute_is_left_alone_although_reports_wait(monkeypatch):
+    monkeypatch.setattr(subprocess, "Popen", lambda *_arguments, **_options: Unread())
+    process = stop_receiver.start("r1", [], [], "")
+    for _ in range(30):
+        send_packet(process.near, pack_report(DriverReport(0, "DISARMED", True, True)))
+    lives = []
+    for second in range(100):
+        process.keep_alive(second * 1_000_000)
+        if process._process not in lives:
+            lives.append(process._process)
+        assert process._process.poll() is None or second % 31 == 30, "each start gets 30 s"
+    assert len(lives) == 4
+    while process._unread_bytes():
+        process.far.recv(100)
+    process.close()
+
+
 def test_killed_forwarder_is_logged_by_its_own_name(started, caplog):
     process = started(stop_forwarder.start([], ""))
     process._process.kill()
