@@ -211,9 +211,11 @@ class _StopPort:
         return answers
 
     def stop_until_proven(self) -> StopRequests:
-        """Repeat STOP as a sender does, until an answer proves that the robot has stopped, or for a second."""
-        requests, until_us = StopRequests(self.bench.robot, self.secret, self._counter()), self.bench.now_us + _STOP_US
-        while self.bench.now_us < until_us and not requests.is_stopped:
+        """Repeat STOP as a sender does, until an answer proves that the robot has stopped, at most for a second."""
+        requests = StopRequests(self.bench.robot, self.secret, self._counter())
+        for _ in range(_STOP_US // _STOP_EVERY_US):  # counted, because the kit may have no processor for a while
+            if requests.is_stopped:
+                break
             for data in requests.datagrams():
                 for answer in self.send(data):
                     requests.on_datagram(answer)
@@ -234,9 +236,9 @@ class _StopPort:
         return head + (hmac.digest(self.secret, head, "sha256") if self.secret else bytes(32))
 
     def learn_challenge(self) -> None:
-        """Request the challenge of a robot with a STOP secret."""
+        """Request the challenge of a robot with a STOP secret, once, so that no answer comes later."""
         if self.secret:
-            answers = self.send(self.datagram(challenge=NO_CHALLENGE), _IGNORED_US)
+            answers = self.send(self.datagram(challenge=NO_CHALLENGE), _STOP_US)
             self.bench.need(answers, _NO_PORT)
             self.challenge = unpack_stop(answers[0]).challenge
 

@@ -1,10 +1,11 @@
 """The cases with sockets of their own, in real time: our own links and a small server pass; and the raw client."""
 
 from pathlib import Path
+from threading import Timer
 
 import pytest
 
-from sightline.conformance.raw_peers import LOST, PING, TEXT, RawWebSocket, split_url, xor
+from sightline.conformance.raw_peers import LOST, PING, TEXT, RawStopPort, RawWebSocket, split_url, xor
 from sightline.conformance.robot.cases import CASES
 from sightline.conformance.runner import Outcome, run_cases
 from sightline.protocol.errors import ConfigError, LinkError
@@ -41,12 +42,22 @@ def test_stop_port_whose_secret_the_kit_lacks_is_not_a_failure(name, outcome):
 
 
 @pytest.mark.waits
-def test_stop_is_timed_from_its_datagram_while_the_kit_has_no_processor(monkeypatch):
+@pytest.mark.parametrize("name", ["R-STOP-23", "R-STOP-24"])
+def test_stop_by_datagram_passes_while_the_kit_has_no_processor(monkeypatch, name):
     with small_server(guarded=True) as (bench, prepare):
         rest = bench.rest
-        monkeypatch.setattr(bench, "rest", lambda for_us: rest(for_us + 700_000 * (for_us == 20_000)))
-        [result] = run_cases([case for case in REAL if case.id == "R-STOP-23"], bench, prepare)
+        monkeypatch.setattr(bench, "rest", lambda for_us: rest(for_us + 1_000_000 * (for_us == 20_000)))
+        [result] = run_cases([case for case in REAL if case.id == name], bench, prepare)
     assert result.outcome is Outcome.PASSED, result.reason
+
+
+@pytest.mark.waits
+def test_stop_port_passes_over_a_link_of_80_ms(monkeypatch):
+    send = RawStopPort.send
+    monkeypatch.setattr(RawStopPort, "send", lambda *arguments: Timer(0.16, send, arguments).start())
+    with small_server(guarded=True) as (bench, prepare):
+        results = run_cases([case for case in REAL if "R-STOP-22" <= case.id <= "R-STOP-26"], bench, prepare)
+    assert len(results) == 5 and bad(results) == {}
 
 
 @pytest.mark.long
