@@ -11,6 +11,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
+from importlib import import_module
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, Final, Literal, Self
@@ -172,6 +173,9 @@ def check_target(path: Path, seconds: float | None) -> None:
     check_out_file(path)
     if kind not in PICTURES and path.exists() and not path.is_file():
         raise ConfigError(f"cannot write {path}: it is a device or a pipe; name a file")
+    if kind == MESSAGES:
+        with needs("report"):
+            import_module("mcap.writer")
 
 
 def snapshot(pictures: Pictures, path: Path, wanted: Channel) -> Captured:
@@ -203,8 +207,9 @@ def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Cap
 def record(link: Link, pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Recorder:
     """Write the messages of `seconds`, or until Ctrl-C, SIGTERM or SIGHUP, to `path`. `wanted` may add the overlay.
 
-    A file that is there already stays until then. Raises LinkError if none arrives, ConfigError for a file that another
-    recording writes, or that cannot be written to its end. Its beginning is kept, next to a file that was there.
+    A file that is there already stays until then. Raises LinkError if none arrives, KeyboardInterrupt if Ctrl-C comes
+    first, ConfigError for a file that another recording writes, or that cannot be written to its end. Its beginning is
+    kept, next to a file that was there.
     """
     target = Path(os.path.realpath(path))
     beside = whole(target, MESSAGES) if target.is_file() else nullcontext(target)
@@ -218,7 +223,7 @@ def record(link: Link, pictures: Pictures, path: Path, wanted: Channel, seconds:
                     ends_s, has_begun = time.monotonic() + seconds, True
         if not (recorder.failed or recorder.counts):
             part.unlink()
-            raise LinkError(_silence(pictures, wanted))
+            raise KeyboardInterrupt if time.monotonic() < ends_s else LinkError(_silence(pictures, wanted))
         if recorder.failed:
             is_beside = part != target
             kept = part.rename(part.with_name(part.name.removeprefix("."))) if is_beside else path

@@ -6,6 +6,7 @@ import os
 import re
 import resource
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -310,6 +311,29 @@ def test_ended_recording_is_kept(tmp_path: Path, number: signal.Signals) -> None
     record(robot, robot, tmp_path / "run.mcap", FRAME, 60.0)
     assert [one.message for one in read_recording(tmp_path / "run.mcap")] == [status(1), status(2)]
     assert signal.getsignal(number) is before
+
+
+@pytest.mark.usefixtures("hangs_up")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("earlier", [b"earlier", None])
+def test_recording_that_ends_before_its_first_message_ends_the_command(tmp_path: Path, number, earlier) -> None:
+    path = tmp_path / "run.mcap"
+    if earlier is not None:
+        path.write_bytes(earlier)
+    robot = Talking([lambda: signal.raise_signal(number)])
+    with pytest.raises(KeyboardInterrupt):
+        record(robot, robot, path, FRAME, 60.0)
+    assert {one: one.read_bytes() for one in tmp_path.iterdir()} == ({path: earlier} if earlier else {})
+
+
+def test_recording_without_its_package_is_an_error_and_leaves_no_file(monkeypatch, capsys, tmp_path: Path) -> None:
+    robot = Talking([status(1)])
+    monkeypatch.setattr(watch, "open_link", lambda *_given, **_more: nullcontext(robot))
+    monkeypatch.setattr(watch, "Pictures", lambda *_given: robot)
+    monkeypatch.setitem(sys.modules, "mcap.writer", None)
+    code, _, err = run(capsys, "capture", "r1", "--connect", "tcp/127.0.0.1:1", "--out", str(tmp_path / "run.mcap"))
+    assert code == 2 and "mcap is not installed: " in err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_recording_without_a_message_is_an_error_and_leaves_no_file(monkeypatch, tmp_path: Path) -> None:
