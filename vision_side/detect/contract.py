@@ -130,6 +130,8 @@ def _check(ended: "queue.SimpleQueue[str | BaseException]", check: "_Check", mak
         detector = make()
         try:
             wrong = check(detector, make, seed)
+        except ConfigError as error:
+            wrong = str(error)
         except PLUGIN_ERRORS as error:  # violates the promise to raise nothing
             wrong = f"it raises {type(error).__name__}: {report_fault('detector', error)}"[:160]
         finally:
@@ -178,7 +180,7 @@ def _keeps_answering(detector: Detector, _make: Make, seed: int) -> str:
     """Every image gets an answer, of any size, black, noise or full."""
     for size in SIZES:
         for index, frame in enumerate(drawn_frames(seed, 8, size)):
-            if detector.detect([frame], NO_DEADLINE)[0] is None:
+            if _answer(detector, frame) is None:
                 return f"no answer to image {index} of {size[0]}x{size[1]}"
     return ""
 
@@ -188,12 +190,12 @@ def _keeps_bounds(detector: Detector, _make: Make, seed: int) -> str:
     furthest_px = 0.0
     for size in SIZES:
         for frame in drawn_frames(seed, 8, size):
-            for result in detector.detect([frame], NO_DEADLINE):
-                wrong = result and _out_of_bounds(result)
-                if wrong:
-                    return wrong
-                ends = [max(one.x2_px, one.y2_px) for one in result.detections] if result else []
-                furthest_px = max(furthest_px, *ends, 0.0)
+            result = _answer(detector, frame)
+            wrong = result and _out_of_bounds(result)
+            if wrong:
+                return wrong
+            ends = [max(one.x2_px, one.y2_px) for one in result.detections] if result else []
+            furthest_px = max(furthest_px, *ends, 0.0)
     return "all boxes lie within two pixels of the corner, as if from 0 to 1" if 0 < furthest_px < NORMALIZED_PX else ""
 
 
@@ -231,9 +233,9 @@ def _keeps_silence(detector: Detector, _make: Make, seed: int) -> str:
     cut, other = good[0].jpeg[: len(good[0].jpeg) // 3], _jpeg(Random(seed), (64, 48))
     for jpeg in (b"", b"\xff\xd8\xff", cut, other, b"\0" * 500):
         bad = DetectFrame("r1", good[0].header, jpeg, decoder)
-        if detector.detect([bad], NO_DEADLINE)[0] is not None and _is_bad(bad):
+        if _answer(detector, bad) is not None and _is_bad(bad):
             return f"{len(jpeg)} bytes that are not an image get an answer"
-        if detector.detect([good[1]], NO_DEADLINE)[0] is None:
+        if _answer(detector, good[1]) is None:
             return "no answer to a good frame after a bad one"
     return ""
 
@@ -273,10 +275,7 @@ def _keeps_robots_apart(detector: Detector, make: Make, seed: int) -> str:
 
 def _keeps_its_name(detector: Detector, _make: Make, seed: int) -> str:
     """Every result names its detector, model, device and time, and `labels` is a list of texts."""
-    try:
-        labels_of(detector)
-    except ConfigError as error:
-        return str(error)
+    labels_of(detector)
     for result in _seen(detector, drawn_frames(seed, 2, SIZES[0])):
         if result is None:
             continue
@@ -297,7 +296,13 @@ _CHECKS: Final = (_keeps_order, _keeps_answering, _keeps_bounds, _keeps_places, 
 
 
 def _seen(detector: Detector, frames: Iterator[DetectFrame]) -> list[DetectionResult | None]:
-    return [detector.detect([frame], NO_DEADLINE)[0] for frame in frames]
+    return [_answer(detector, frame) for frame in frames]
+
+
+def _answer(detector: Detector, frame: DetectFrame) -> DetectionResult | None:
+    if len(results := detector.detect([frame], NO_DEADLINE)) != 1:
+        raise ConfigError(f"1 frame gets {len(results)} results")
+    return results[0]
 
 
 def _unlike(frame: DetectFrame, one: DetectionResult) -> str:

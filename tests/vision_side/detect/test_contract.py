@@ -340,3 +340,15 @@ def test_results_in_a_tuple_are_reported_and_each_other_promise_is_checked(answe
             return answers(super().detect(frames, deadline_us))
 
     assert {one.name: one.wrong for one in check_detector(InTuple) if one.wrong} == failed
+
+
+@pytest.mark.parametrize("counts", [0, 2])
+def test_frame_that_gets_no_single_result_is_reported_as_that(counts) -> None:
+    """Before, the row about bytes that are not an image named an IndexError, which the check raised itself."""
+
+    class LeavesOut(Broken):
+        def detect(self, frames, deadline_us):
+            return [one for one in super().detect(frames, deadline_us) for _ in range(1 if one else counts)]
+
+    wrong = {one.name: one.wrong for one in check_detector(LeavesOut) if one.wrong}
+    assert wrong == {"silence": f"1 frame gets {counts} results"}
