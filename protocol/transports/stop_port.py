@@ -219,7 +219,7 @@ _UNREAD_BYTES: Final = 240
 _MAX_BEHIND: Final = 5
 """Checks, a second after each other, that find so many unread bytes in the pipe of a stopped or hung process."""
 _START_CHECKS: Final = 30
-"""Such checks after a start, which may read its modules from a slow card."""
+"""Such checks after a start, which may read its modules from a slow card. They end when no packet is unread."""
 _CHILD: Final = (
     "import sys; top = type(sys)('sightline'); top.__path__ = [sys.argv.pop(1)]; sys.modules['sightline'] = top; "
     "from sightline.{} import main; main()"
@@ -254,7 +254,9 @@ class StopProcess:
             return
         self._start_at_us = at_us + _RESTART_US
         if self._process is not None and self._process.poll() is None:
-            self._behind = self._behind + 1 if self._unread_bytes() >= _UNREAD_BYTES else 0
+            unread_bytes = self._unread_bytes()
+            is_behind = unread_bytes >= _UNREAD_BYTES or (self._behind < 0 < unread_bytes)
+            self._behind = self._behind + 1 if is_behind else 0
             if self._behind == _MAX_BEHIND:
                 self._process.kill()
         else:

@@ -195,6 +195,8 @@ def test_stopped_receiver_is_logged_and_started_again(started, operator, caplog)
     process = started(stop_receiver.start("r1", [address], [], ""))
     driver, begin_us = Driver(process), now_us() + 1_000_000
     assert stop(operator, address, driver, StopRequests("r1", b"", 7))
+    assert until(lambda: process._unread_bytes() == 0, START_S)
+    process.keep_alive(begin_us - 1_000)
     stopped = process._process
     stopped.send_signal(signal.SIGSTOP)
     report_for(process, 6, begin_us=begin_us)
@@ -240,14 +242,15 @@ class Unread:
     wait = poll
 
 
-def test_start_that_takes_half_a_minute_is_left_alone_although_reports_wait(monkeypatch):
+@pytest.mark.parametrize("waiting", [1, 12, 30])
+def test_start_that_takes_half_a_minute_is_left_alone_although_reports_wait(monkeypatch, waiting):
     monkeypatch.setattr(subprocess, "Popen", lambda *_arguments, **_options: Unread())
     process = stop_receiver.start("r1", [], [], "")
-    for _ in range(30):
+    for _ in range(waiting):
         send_packet(process.near, pack_report(DriverReport(0, "DISARMED", True, True)))
-    lives = []
+    lives, begin_us = [], 10_000_000
     for second in range(100):
-        process.keep_alive(second * 1_000_000)
+        report_for(process, 1, begin_us=begin_us + second * 1_000_000)
         if process._process not in lives:
             lives.append(process._process)
         assert process._process.poll() is None or second % 31 == 30, "each start gets 30 s"
