@@ -138,11 +138,13 @@ def _from_file(file: str, origin: str) -> Iterable[Given]:
     except OSError as error:
         raise ConfigError(f"cannot read {file}: {error.strerror}; name a TOML file that you may read") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ConfigError(f"{file}: invalid TOML: {error}{_decimal_hint(file, error)}") from None
+        raise ConfigError(f"{file}: invalid TOML: {error}{_fix_of(file, error)}") from None
 
 
-def _decimal_hint(file: str, error: Exception) -> str:
-    """Return the fix for a number with a decimal comma in the line of the error, or an empty text."""
+def _fix_of(file: str, error: Exception) -> str:
+    """Return the fix for another encoding, and for a number with a decimal comma in the line of the error, or ""."""
+    if isinstance(error, UnicodeDecodeError):
+        return "; save it as UTF-8"
     place = re.search(r"at line (\d+)", str(error))
     lines = home_path(file).read_text("utf-8").splitlines() if place else []
     found = re.search(r"=\s*(-?\d+),(\d+)\s*(#|$)", lines[int(place[1]) - 1]) if place and lines else None

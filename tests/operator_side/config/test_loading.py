@@ -121,6 +121,14 @@ def test_value_in_place_of_another_type_names_no_code(service):
                 assert one_line(error).endswith(" = 3: expected a table"), key
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-32", "latin-1"])
+def test_file_in_another_encoding_states_the_right_one(tmp_path, encoding):
+    (path := tmp_path / "robot.toml").write_text('robot = "ä"\n', encoding)
+    with pytest.raises(ConfigError) as error:
+        load("robot", file=str(path), environ={})
+    assert one_line(error).startswith(f"{path}: ") and one_line(error).endswith("; save it as UTF-8")
+
+
 def test_several_errors_are_shown_as_the_first_and_a_count(tmp_path):
     path = tmp_path / "robot.toml"
     path.write_text("foo = 1\n[safety]\nmax_linear_mps = -1\nsilence_ms = 'x'\n")
