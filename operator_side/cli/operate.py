@@ -245,8 +245,11 @@ def mission(
     from sightline.operator_side.config.toml_text import options_of
 
     options = options_of(sets or ())
+    key = "label" if name == "legs" else "target.label"
+    if label and key in options:
+        raise ConfigError(f"--label and --set {key} exclude each other; remove one")
     if label:
-        options["label" if name == "legs" else "target.label"] = label
+        options[key] = label
     if options and name is None:
         option, example = ("--set", "--set KEY=VALUE") if sets else ("--label", f"--label {label}")
         raise ConfigError(f"{option} needs a mission to start; name it, e.g. sightline mission r1 follow {example}")

@@ -288,6 +288,9 @@ def test_command_whose_standard_streams_are_closed_has_the_null_device_and_so_ha
         (["mission", "r1", "--label", "person"], 2,
          "--label needs a mission to start; name it, e.g. sightline mission r1 follow --label person"),
         (["mission", "r1", "--set", "a=1"], 2, "--set needs a mission to start; name it, e.g. sightline mission r1 "),
+        *((["mission", "r1", name, "--label", "a", "--set", f"{key}=b"], 2,
+           f"--label and --set {key} exclude each other; remove one")
+          for name, key in (("follow", "target.label"), ("legs", "label"))),
         (["detector", "check", "boxs"], 2, "did you mean 'boxes'?"),
         (["detector", "check", "hsv", "--set", "a"], 2, "expected KEY=VALUE, e.g. --set min_score=0.5"),
         (["detector", "check", "onnx:"], 2, "has nothing after its colon; write onnx"),
