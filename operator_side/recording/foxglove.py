@@ -47,7 +47,7 @@ def shown(message: Message, log_time_ns: int) -> bytes:
             payload = json.dumps(_text(channel, payload)).encode()
         data = b'"data":%b%b}' % (payload, (more[1:-1] and "," + more[1:-1]).encode())
         data = b"%b%b,%b" % (_HEADER.encode(), message.header, data) if message.header else b"{" + data
-        # Valid JSON has no Infinity; readers take a number beyond their range for it.
+        # Valid JSON has no Infinity; readers take a number beyond their range for it. Viewers draw null at the sensor.
         data = data.replace(b"Infinity", b"1e999") if channel is SCAN else data
         if received(channel, message.source, data) == message:
             return data
