@@ -32,9 +32,10 @@ def check_robot_id(robot: str) -> str:
         ConfigError: the id cannot be part of a key.
     """
     if not ROBOT_ID.fullmatch(robot):
+        fix = "; pass an address with --connect" if "/" in robot and ":" in robot else ""
         raise ConfigError(
             f"invalid robot id {robot!r}: expected 1 to 32 letters, digits, '_', '-' or '.', starting with a letter or "
-            f"digit (no '/' or '*'), e.g. r1{'; pass an address with --connect' if {*'/:'} <= {*robot} else ''}"
+            f"digit (no '/' or '*'), e.g. r1{fix}"
         )
     return robot
 
