@@ -7,8 +7,7 @@ docs/explanation/decisions/0003 compares this rule with a lane of free distance.
 """
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 
 from pydantic import Field
 
@@ -46,22 +45,38 @@ class GuardConfig(Config):
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Near:
-    """One near point as an inequality: `linear * forward + angular * turning <= limit_mps`."""
+_Near = tuple[float, float, float]
+"""One near point as an inequality (forward, turning, limit_mps): `linear * forward + angular * turning <= limit_mps`.
 
-    forward: float
-    turning: float
-    limit_mps: float
+A plain tuple, because a scan has up to 16,384 points, and the control loop passes all of them at each tick.
+"""
 
-    def cut(self, linear: float, angular: float) -> tuple[float, float]:
-        """Return a twist within the limit. Speed is reduced before turning, so that the robot can turn away."""
-        if linear * self.forward + angular * self.turning <= self.limit_mps:
-            return linear, angular
-        left_mps = self.limit_mps - angular * self.turning
-        if left_mps >= 0:
-            return left_mps / self.forward, angular
-        return 0.0, self.limit_mps / self.turning
+
+def _cut(near: _Near, angular: float) -> tuple[float, float]:
+    """Return the twist at the limit. Speed is reduced before turning, so that the robot can turn away."""
+    forward, turning, limit_mps = near
+    left_mps = limit_mps - angular * turning
+    if left_mps >= 0:
+        return left_mps / forward, angular
+    return 0.0, limit_mps / turning
+
+
+def _inequalities(config: GuardConfig, points: Iterable[tuple[float, float]]) -> Iterator[_Near]:
+    """Yield the inequality of each point, x_m and y_m from the midpoint of the axle."""
+    front_m, rear_m, half_width_m = config.front_m, config.rear_m, config.half_width_m
+    stop_m, braking_mps2 = config.stop_m, 2 * config.brake_mps2
+    for x_m, y_m in points:
+        nearest_x_m = max(-rear_m, min(front_m, x_m))
+        nearest_y_m = max(-half_width_m, min(half_width_m, y_m))
+        clearance_m = math.hypot(x_m - nearest_x_m, y_m - nearest_y_m)
+        # A point inside the outline is noise or a part of the robot and has no direction. It counts as ahead or behind,
+        # which blocks motion toward the point and permits motion away from it.
+        inside = clearance_m < 1e-6
+        forward = math.copysign(1.0, x_m) if inside else (x_m - nearest_x_m) / clearance_m
+        sideways = 0.0 if inside else (y_m - nearest_y_m) / clearance_m
+        limit_mps = math.sqrt(braking_mps2 * max(0.0, clearance_m - stop_m))
+        # Rigid-body motion: the nearest spot of the outline moves at v + w x r = (linear - angular * y, angular * x).
+        yield forward, sideways * nearest_x_m - forward * nearest_y_m, limit_mps
 
 
 def _met_m(scan: Ranges, range_m: float) -> float | None:
@@ -92,25 +107,12 @@ class RangeGuard:
             return
         self._scan_us = scan.t_us
         angles = (scan.angle_min_rad + index * scan.angle_increment_rad for index in range(len(met_m)))
-        self._near = [
-            self._inequality(self._config.sensor_x_m + range_m * math.cos(angle_rad), range_m * math.sin(angle_rad))
+        sensor_x_m = self._config.sensor_x_m
+        self._near = list(_inequalities(self._config, (
+            (sensor_x_m + range_m * math.cos(angle_rad), range_m * math.sin(angle_rad))
             for range_m, angle_rad in zip(met_m, angles, strict=True)
             if range_m is not None and range_m < math.inf
-        ]
-
-    def _inequality(self, x_m: float, y_m: float) -> _Near:
-        config = self._config
-        nearest_x_m = max(-config.rear_m, min(config.front_m, x_m))
-        nearest_y_m = max(-config.half_width_m, min(config.half_width_m, y_m))
-        clearance_m = math.hypot(x_m - nearest_x_m, y_m - nearest_y_m)
-        # A point inside the outline is noise or a part of the robot and has no direction. It counts as ahead or behind,
-        # which blocks motion toward the point and permits motion away from it.
-        inside = clearance_m < 1e-6
-        forward = math.copysign(1.0, x_m) if inside else (x_m - nearest_x_m) / clearance_m
-        sideways = 0.0 if inside else (y_m - nearest_y_m) / clearance_m
-        limit_mps = math.sqrt(2 * config.brake_mps2 * max(0.0, clearance_m - config.stop_m))
-        # Rigid-body motion: the nearest spot of the outline moves at v + w x r = (linear - angular * y, angular * x).
-        return _Near(forward, sideways * nearest_x_m - forward * nearest_y_m, limit_mps)
+        )))
 
     def limit(self, twist: Twist, now_us: int) -> Twist:
         """Limit a twist by the newest scan.
@@ -126,8 +128,13 @@ class RangeGuard:
             return twist if twist == STILL else Twist(linear_mps=0.0, angular_rad_s=0.0)
         linear, angular = twist.linear_mps, twist.angular_rad_s
         for _ in range(_PASSES):
+            before = linear, angular
             for near in self._near:
-                linear, angular = near.cut(linear, angular)
+                forward, turning, limit_mps = near
+                if not linear * forward + angular * turning <= limit_mps:
+                    linear, angular = _cut(near, angular)
+            if (linear, angular) == before:
+                break  # a further pass changes nothing either
         if (linear, angular) == (twist.linear_mps, twist.angular_rad_s):
             return twist
         return Twist(linear_mps=linear, angular_rad_s=angular)

@@ -2,6 +2,7 @@
 
 import array
 import math
+import random
 
 import pytest
 from pydantic import ValidationError
@@ -10,7 +11,7 @@ from sightline.evaluation.scenario_config import robot_config
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import STILL, Twist
 from sightline.robot_side.ports import Ranges
-from sightline.robot_side.safety.guard import BlindZoneError, GuardConfig, RangeGuard, _Near, check_blind_zone
+from sightline.robot_side.safety.guard import BlindZoneError, GuardConfig, RangeGuard, check_blind_zone
 from sightline.sim.robot import load_robot
 
 DEFAULTS = {
@@ -164,9 +165,40 @@ def test_cutting_for_one_point_is_looked_at_again_for_those_before_it():
 def test_late_limit_of_a_turn_applies_to_earlier_points():
     guard = seeing((50.0, 0.0))
     # Two behind the tail that only the speed keeps away, the nearer one first; then a wall that cuts the speed to 0.45.
-    guard._near = [_Near(-1.0, 0.5, 0.06), _Near(-1.0, 0.6, 0.1), _Near(1.0, 0.0, 0.45)]
+    guard._near = [(-1.0, 0.5, 0.06), (-1.0, 0.6, 0.1), (1.0, 0.0, 0.45)]
     assert cut(guard, 1.0, 1.0) == near(0.0, 0.12)
     assert cut(guard, 0.5, 0.5) == near(0.45, 0.5)
+
+
+def limited_in_full(points, config, linear, angular):
+    """The definition, point by point and pass by pass, without any shortcut."""
+    for _ in range(3):
+        for x_m, y_m in points:
+            spot_x_m = min(max(x_m, -config.rear_m), config.front_m)
+            spot_y_m = min(max(y_m, -config.half_width_m), config.half_width_m)
+            clearance_m = math.hypot(x_m - spot_x_m, y_m - spot_y_m)
+            forward, sideways = (x_m - spot_x_m) / clearance_m, (y_m - spot_y_m) / clearance_m
+            turning = sideways * spot_x_m - forward * spot_y_m
+            limit_mps = math.sqrt(2 * config.brake_mps2 * max(0.0, clearance_m - config.stop_m))
+            if linear * forward + angular * turning > limit_mps:
+                free_mps = limit_mps - angular * turning
+                linear, angular = (free_mps / forward, angular) if free_mps >= 0 else (0.0, limit_mps / turning)
+    return linear, angular
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_every_point_of_a_scan_limits_the_twist_in_each_pass(seed):
+    draw, config = random.Random(seed), GuardConfig(**BOX)
+    nearest_m = draw.choice([1.15, 1.3, 1.6])  # the corners of the outline are 1.04 m away
+    ranges_m = array.array("d", [draw.uniform(nearest_m, 3.0) for _ in range(100)])
+    guard = RangeGuard(config)
+    guard.see(Ranges(0, -math.pi, math.tau / 100, 0.0, 100.0, ranges_m))
+    bearings_rad = [-math.pi + index * (math.tau / 100) for index in range(100)]
+    pairs = zip(ranges_m, bearings_rad, strict=True)
+    points = [(range_m * math.cos(bearing_rad), range_m * math.sin(bearing_rad)) for range_m, bearing_rad in pairs]
+    for _ in range(30):
+        wanted = draw.uniform(-2, 2), draw.uniform(-4, 4)
+        assert cut(guard, *wanted) == near(*limited_in_full(points, config, *wanted))
 
 
 # --- inside the outline ------------------------------------------------------------------------------------------
