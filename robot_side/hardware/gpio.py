@@ -243,7 +243,7 @@ def _ensure_factory(gpiozero: Any) -> bool:
     except Exception as error:
         raise HardwareError(
             f"no GPIO here: {_line(error)}; this drive needs a Raspberry Pi and a user in the group gpio "
-            "(`--set drive.kind=log` tries the rest without wheels)"
+            "(`--set drive.kind=log --set drive.options={}` tries the rest without wheels)"
         ) from None
     return True
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -55,8 +56,11 @@ def test_machine_without_pins_gives_one_error_line(monkeypatch):
     fake = SimpleNamespace(LGPIOFactory=lambda: 1 / 0)
     monkeypatch.setitem(sys.modules, "gpiozero.pins.lgpio", fake)
     monkeypatch.setitem(sys.modules, "lgpio", SimpleNamespace())
-    with pytest.raises(HardwareError, match="no GPIO here: division by zero; this drive needs a Raspberry Pi"):
+    with pytest.raises(HardwareError, match="no GPIO here: division by zero; this drive needs a Raspberry Pi") as error:
         GpioDrive(config())
+    command = shlex.split(str(error.value).split("`")[1])  # it must work with the configuration of the car
+    car = load_service("robot", file=str(ROOT / "examples/raspberry-car.toml"), environ={}, sets=command[1::2]).config
+    DRIVES.build(car.motors).close()
 
 
 def test_pins_of_another_process_are_reported(board, drive):
