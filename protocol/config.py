@@ -123,7 +123,7 @@ class PluginRegistry:
         except PLUGIN_ERRORS as error:  # from the import of a plug-in
             if not isinstance(error, ImportError | AttributeError):  # these errors name the missing part
                 report_ending(self.noun, error)
-            hint = "" if entry is not None else self._hint(kind)
+            hint = "" if entry is not None else self._hint(kind) or _folder_hint(error, kind)
             raise ConfigError(f"{self.noun} {kind!r} cannot be loaded: {_why(error, kind)}{hint}") from None
         there = f"there are {', '.join(sorted((*self.names(), *self.also)))}"
         there += ", or package.module:Name" if takes_classes else ""
@@ -164,6 +164,13 @@ def _imported(path: str) -> Any:
         hint = f"; did you mean {module}:{nearest[0]}?" if nearest else ""
         raise ImportError(f"{getattr(found, '__file__', None) or module} has no {name}{hint}")
     return getattr(found, name)
+
+
+def _folder_hint(error: BaseException, kind: str) -> str:
+    """Return where the module of a class is searched, if it is the module that is missing."""
+    module = kind.partition(":")[0].partition(".")[0]
+    is_absent = isinstance(error, ModuleNotFoundError) and error.name == module and module not in _OLD_PACKAGES
+    return f"; start the command in the folder that has {module}, not in {Path.cwd()}" if is_absent else ""
 
 
 class _OldPackages:

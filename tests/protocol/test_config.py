@@ -77,6 +77,14 @@ def test_other_missing_module_is_named(folder):
         CAMERAS.load("needs_more:Camera")
 
 
+@pytest.mark.parametrize("kind", ["no_such_module:Camera", "no_such_module.inner:Camera"])
+def test_class_of_another_folder_is_reported_with_the_folder_that_was_searched(folder, kind):
+    with pytest.raises(ConfigError) as error:
+        CAMERAS.load(kind)
+    assert str(error.value) == (f"camera '{kind}' cannot be loaded: No module named 'no_such_module'; "
+                                f"start the command in the folder that has no_such_module, not in {folder}")
+
+
 def test_plug_in_that_exits_on_import_does_not_end_the_service(folder):
     (folder / "leaves.py").write_text("import sys\nsys.exit('bye\\nnow')\n")
     with pytest.raises(ConfigError, match=r"'leaves:Camera' cannot be loaded: SystemExit: bye now$"):
