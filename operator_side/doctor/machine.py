@@ -191,6 +191,8 @@ def _certificates(folder: str) -> Iterator[Finding]:
     for one in certificates:
         problem = one.problem(now)
         fix = f"sightline keys add {folder} {one.role}"
+        if not (Path(folder) / "ca.key").exists():
+            fix = f"run `sightline keys add DIR {one.role}` where ca.key is, and copy the new files to {folder}"
         if now < one.begins:
             fix = "set the clock of this machine: sudo timedatectl set-ntp true"
         elif one.ends_with_authority and not one.is_foreign:

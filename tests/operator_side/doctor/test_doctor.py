@@ -20,7 +20,7 @@ from sightline.operator_side.doctor import network as between
 from sightline.operator_side.doctor.finding import Finding, as_object, histogram
 from sightline.operator_side.setup import keys
 from sightline.protocol.config import Config
-from sightline.protocol.errors import LinkError
+from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports import diagnosis
 from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.zenoh.link import open_zenoh
@@ -195,6 +195,16 @@ def test_key_of_another_authority_is_reported(capsys, tmp_path):
     checks = _checks(capsys, "--secure", str(tmp_path / "k"))
     assert checks["key robot"]["value"].startswith("of another authority") and checks["key vision"]["ok"]
     assert checks["key robot"]["fix"] == f"sightline keys add {tmp_path / 'k'} robot"
+
+
+def test_fix_of_a_machine_without_the_authority_names_the_other_machine(capsys, tmp_path):
+    keys.make(tmp_path / "k", [])
+    keys.add(tmp_path / "k", "vision", [], days=10)
+    (tmp_path / "k/ca.key").unlink()  # as on every machine but one
+    with pytest.raises(ConfigError):
+        keys.add(tmp_path / "k", "vision", [])
+    fix = _checks(capsys, "--secure", str(tmp_path / "k"))["key vision"]["fix"]
+    assert fix == f"run `sightline keys add DIR vision` where ca.key is, and copy the new files to {tmp_path}/k"
 
 
 def test_unreadable_certificates_are_reported_with_the_extra(capsys, tmp_path, monkeypatch):
