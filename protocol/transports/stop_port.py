@@ -184,8 +184,9 @@ def stop_secret_file(folder: str) -> str:
     """
     file = home_path(folder) / STOP_SECRET_FILE
     if not file.is_file():
-        raise ConfigError(f"{file} is missing: STOP works on the link only; add it with `sightline keys add {folder} "
-                          "stop`, and copy it to robots, routers and operators")
+        raise ConfigError(f"{file} is missing: STOP works on the link only; copy it from where the keys were made; if "
+                          f"it is missing there too, add it there with `sightline keys add {folder} stop`, and copy it "
+                          "to robots, routers and operators")
     read_secret(str(file))
     return str(file)
 

@@ -174,6 +174,7 @@ def test_a_key_folder_without_the_secret_gets_one_line_with_the_command(tmp_path
     assert stop_receiver_of(RobotConfig(secure=str(tmp_path))) is None
     [record] = caplog.records
     assert f"`sightline keys add {tmp_path} stop`" in record.getMessage()
+    assert "copy it from where the keys were made" in record.getMessage()  # a secret of its own stops no robot
     (tmp_path / "stop.secret").write_text("a secret of this site")
     receiver = stop_receiver_of(RobotConfig(secure=str(tmp_path)))
     receiver.close()
