@@ -58,7 +58,8 @@ def _edited(text: str, ranges: Ranges) -> str:
     hsv = document.setdefault("hsv", tomlkit.table())
     if isinstance(hsv, MutableMapping) and not isinstance(hsv, InlineTable):
         hsv["ranges"] = _item(ranges, hsv.get("ranges"))
-    return document.as_string()
+    after = document.as_string()
+    return after if after.endswith("\n") else f"{after}\n"  # tomlkit ends a new array without a line end
 
 
 def _item(ranges: Ranges, old: Item | None) -> Any:
@@ -66,7 +67,8 @@ def _item(ranges: Ranges, old: Item | None) -> Any:
     comments = "".join(f"{line.rstrip()}\n" for line in re.findall("#.*", old.as_string() if old else ""))
     if isinstance(old, AoT):
         blocks = ["".join(f"{name} = {getattr(one, name):g}\n" for name in _FIELDS) for one in ranges]
-        return tomlkit.parse(f"[[ranges]]\n{comments}" + "\n[[ranges]]\n".join(blocks))["ranges"]
+        space = "\n" if re.search(r"\n\r?\n$", old.as_string()) else ""  # the blank line before the next table
+        return tomlkit.parse(f"[[ranges]]\n{comments}" + "\n[[ranges]]\n".join(blocks) + space)["ranges"]
     array = ranges_toml(ranges).replace("[\n", f"[\n{comments}", 1)
     return tomlkit.parse(f"ranges = {array}")["ranges"]
 

@@ -58,8 +58,17 @@ def test_only_the_ranges_change_and_no_comment_is_lost(name, ranges):
     was.get("hsv", {}).pop("ranges", None)
     assert {key: value for key, value in read.items() if value} == {key: value for key, value in was.items() if value}
     assert comments(after) == comments(before)
+    assert after.endswith("\n")
     again = with_ranges(after, ranges)
     assert tomllib.loads(again) == tomllib.loads(after)
+
+
+@pytest.mark.parametrize("ranges", [YELLOW, RED], ids=["one", "two"])
+def test_the_configuration_of_the_car_keeps_its_layout(ranges):
+    before = (Path(__file__).parents[3] / "examples/raspberry-car-vision.toml").read_text()
+    start, end = before.index("[[hsv.ranges]]"), before.index("\n[steer]")
+    after = with_ranges(before, ranges)
+    assert after.startswith(before[:start]) and after.endswith(f"value_low = {ranges[-1].value_low}\n{before[end:]}")
 
 
 @pytest.mark.parametrize(("text", "words"), [
