@@ -54,7 +54,8 @@ class WheelAngles:
     Args:
         left_rad: angle of the left wheel since the start, rad.
         right_rad: angle of the right wheel since the start, rad.
-        t_us: time of the reading, us. A reading with the time of the last one, or an older one, is ignored.
+        t_us: time of the reading, us, not of the call. A reading with the time of the last one, or an older one, is
+            ignored. An old reading with a new time looks like a wheel that stands, and then like one that races.
     """
 
     left_rad: float
