@@ -19,6 +19,8 @@ class DeviceGroup(Generic[Port]):
     key: str
     port: type[Any]
     entry_points: str
+    also: tuple[str, ...] = ()
+    """Further kinds that the configuration takes, for the error text."""
 
     def build(self, choice: PluginChoice, *, is_last: bool = True) -> Port:
         """Create the device that `choice` names.
@@ -62,14 +64,14 @@ class DeviceGroup(Generic[Port]):
 
     def load(self, choice: PluginChoice) -> tuple[Any, Any]:
         """Load the class and check its `Config`, without opening the device. Raises ConfigError."""
-        registry = PluginRegistry(self.noun, self.entry_points)
+        registry = PluginRegistry(self.noun, self.entry_points, self.also)
         plugin = registry.load(choice.kind)
         return plugin, registry.settings(choice.kind, plugin, choice.options)
 
 
 CAMERAS: Final = DeviceGroup[Camera]("camera", Camera, "sightline.cameras")
 DRIVES: Final = DeviceGroup[Drive]("drive", Drive, "sightline.drives")
-RANGE_SENSORS: Final = DeviceGroup[RangeSensor]("range_sensor", RangeSensor, "sightline.range_sensors")
+RANGE_SENSORS: Final = DeviceGroup[RangeSensor]("range_sensor", RangeSensor, "sightline.range_sensors", ("none",))
 BATTERIES: Final = DeviceGroup[Battery]("battery", Battery, "sightline.batteries")
 
 DEVICE_GROUPS: Final[tuple[DeviceGroup[Any], ...]] = (CAMERAS, DRIVES, RANGE_SENSORS, BATTERIES)

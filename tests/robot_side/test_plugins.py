@@ -42,6 +42,16 @@ def test_each_built_in_device_implements_its_port(group):
         assert [name for name in sorted(demanded) if not callable(getattr(plugin, name, None))] == [], kind
 
 
+@pytest.mark.parametrize("group", DEVICE_GROUPS, ids=lambda group: group.key)
+def test_error_of_an_unknown_kind_names_each_kind_that_the_configuration_takes(group):
+    switched_off = RobotConfig.model_validate({group.key: {"kind": "none"}}).devices[group.key] is None
+    with pytest.raises(ConfigError) as error:
+        group.load(PluginChoice(kind="nona"))
+    named = str(error.value).partition("there are ")[2].replace(",", "").split()
+    assert {*ENTRY_POINTS[group.entry_points], *(["none"] if switched_off else [])} <= set(named)
+    assert ("none" in named) == switched_off
+
+
 class OddDevice:
     """Raises as configured."""
 
