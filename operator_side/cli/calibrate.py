@@ -61,7 +61,8 @@ _LONGEST_WAY_M: Final = 20.0
 def run_task(task: str, config: RobotConfig, confirmed: bool) -> int:
     """Run a task of `sightline robot`. Raises ConfigError for an unknown task."""
     if task not in TASKS:
-        hint = f" (a robot's id is given with --robot {task})" if not task.startswith("test") else ""
+        what, option = ("configuration", "--config") if task.endswith(".toml") else ("robot's id", "--robot")
+        hint = f" (a {what} is given with {option} {task})" if not task.startswith("test") else ""
         raise ConfigError(no_such_name("task", task, TASKS) + hint)
     check_confirmed(confirmed, sys.stdin.isatty(), task, "lift the robot")
     is_right = try_wheels(config, None if confirmed else _prompt, typer.echo, _guard)

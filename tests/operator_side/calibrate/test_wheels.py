@@ -128,6 +128,7 @@ def test_any_key_or_terminal_end_sets_zero(monkeypatch, robot, number):
     (["robot", "test-wheels"], "lift the robot, then add --yes"),
     (["robot", "test-wheel"], "unknown task 'test-wheel'; did you mean 'test-wheels'?"),
     (["robot", "r7"], "--robot r7"),
+    (["robot", "my_robot.toml"], "--config my_robot.toml"),
     (["calibrate", "drive", "--set", "drive.kind=log"],
      "no terminal to confirm on; put the robot on the floor, free the way ahead, then add --yes"),
     (["calibrate", "drive", "--duty", "0.4,0.3"], "rising numbers"),
