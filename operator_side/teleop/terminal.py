@@ -39,7 +39,7 @@ def live_lines(robot: str, teleop: Teleop, width: int, now_us: int) -> tuple[str
 
 def _lines(robot: str, teleop: Teleop, now_us: int) -> tuple[str, str]:
     if teleop.report is None:
-        return f"{robot}: {teleop.note or 'no status yet'}", ""
+        return f"{robot}: {teleop.note or 'no status yet; `sightline robots` lists the robots'}", ""
     silent_us = now_us - teleop.received_us
     if silent_us > _SILENT_US:
         return f"{robot}: no status for {silent_us / 1e6:.0f} s; without commands the robot stops", teleop.note

@@ -20,7 +20,7 @@ def shown(rig, width):
 
 def test_lines_show_state_reason_driver_and_fit_the_width():
     rig = TeleopRig()
-    assert shown(rig, 80) == "r1: no status yet\n"
+    assert shown(rig, 80) == "r1: no status yet; `sightline robots` lists the robots\n"
     rig.run(0.3)
     assert shown(rig, 200).startswith("r1 DISARMED: not armed\nno driver | ")
     rig.hold("i")
