@@ -270,7 +270,8 @@ def doctor(
     peer: Annotated[
         str | None,
         typer.Option("--peer", metavar="ENDPOINT",
-                     help="Also check the link to it [default: SIGHTLINE_CONNECT or `sightline use`, if set]."),
+                     help="Also check the link to it [default: SIGHTLINE_CONNECT or `sightline use`, if set; with "
+                          "ROBOT, this machine]."),
     ] = None,
     camera: CameraKind = None,
     camera_sets: CameraSets = None,
@@ -285,7 +286,7 @@ def doctor(
         raise ConfigError(f"robot '{robot}' is an address; run `sightline doctor --peer {robot}`")
     check_camera_sets(camera, camera_sets)
     target = contexts.target_of(robot, None if peer is None else [peer], secure)
-    peers = () if target.origin == "default" else target.connect
+    peers = () if target.origin == "default" and robot is None else target.connect
     if peers and peer is None:
         typer.echo(str(target), err=True)
     found: list[Finding] = []

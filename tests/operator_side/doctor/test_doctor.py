@@ -278,6 +278,7 @@ def test_address_without_peer_is_rejected_with_the_option(capsys):
 
 @pytest.mark.parametrize(("saved", "variable", "given", "expected", "origin"), [
     (None, "", [], ("r1", (), ""), ""),
+    (None, "", ["car"], ("car", ("tcp/127.0.0.1:7447",), ""), "default"),  # a named robot is not ignored
     (Context("tcp/10.0.0.1:7447", "r7", "/keys"), "", [], ("r7", ("tcp/10.0.0.1:7447",), "/keys"), "context.toml"),
     (Context("tcp/10.0.0.1:7447", "r7"), "", ["r8"], ("r8", ("tcp/10.0.0.1:7447",), ""), "context.toml"),
     (Context("tcp/10.0.0.1:7447", "r7", "/keys"), "ws://a:1,ws://b:2", [], ("r1", ("ws://a:1", "ws://b:2"), ""),
