@@ -109,6 +109,7 @@ _SIDES = "left", "right"
 _AT_ONCE_US, _STEP_RAD = 100_000, 0.5
 """A drive may return a reading of up to 100 ms before with a new time; a coarse encoder has a dozen steps a turn."""
 
+_AGED_US = 1_000_000  # a new reading is younger; an older one has another clock, or the unit of another clock
 _LATEST_US = 100_000  # between two calls; a robot that was suspended for longer commanded nothing meanwhile
 
 
@@ -161,11 +162,12 @@ class WheelMonitor:
 
 
 class EncoderMonitor:
-    """Names a wheel whose encoder jumps, stands still while it is commanded, or runs backwards."""
+    """Names a wheel whose encoder jumps, stands still while it is commanded, or runs backwards, and a wrong clock."""
 
     def __init__(self, drive: DiffDriveConfig) -> None:
         self._monitors = WheelMonitor(drive.max_wheel_rad_s), WheelMonitor(drive.max_wheel_rad_s)
         self._looked_us: int | None = None
+        self._read_us = math.inf
 
     @property
     def jumped(self) -> bool:
@@ -186,4 +188,8 @@ class EncoderMonitor:
         doubts = [f"{side} wheel {doubt}"
                   for side, monitor, speed, angle_rad in zip(_SIDES, self._monitors, speeds, angles, strict=True)
                   if (doubt := monitor.look(speed * seconds, angle_rad, wheels.t_us, now_us))]
+        if self._read_us < wheels.t_us < now_us - _AGED_US:
+            age_s = (now_us - wheels.t_us) / 1e6
+            doubts.append(f"a new reading of the wheels is {age_s:.3g} s old; take the robot's clock, in microseconds")
+        self._read_us = wheels.t_us
         return "; ".join(doubts)

@@ -307,6 +307,27 @@ def test_wheel_of_a_robot_that_was_suspended_while_it_drove_is_not_doubted(gap_s
         angle_rad += 8.0 * 0.02
 
 
+@pytest.mark.parametrize(("age_us", "is_old"), [(-1_000_000, False), (0, False), (1_000_000, False), (1_000_001, True)])
+def test_new_readings_of_another_clock_are_named_and_an_old_reading_is_not(age_us, is_old):
+    monitor = EncoderMonitor(DRIVE)
+    for at_us in range(5_000_000, 6_000_000, 20_000):
+        doubt = monitor.look((0.0, 0.0), WheelAngles(0.0, 0.0, at_us - age_us), at_us)
+        assert bool(doubt) is (is_old and at_us > 5_000_000), "the first reading may be an old one"
+        assert doubt in ("", "a new reading of the wheels is 1 s old; take the robot's clock, in microseconds")
+    held = WheelAngles(0.0, 0.0, 5_980_000 - age_us)
+    assert not any(monitor.look((0.0, 0.0), held, at_us) for at_us in range(6_000_000, 9_000_000, 20_000))
+
+
+@pytest.mark.parametrize("unit_us", [1_000, 1_000_000])
+def test_wheel_time_in_another_unit_is_named_at_each_new_reading(unit_us):
+    monitor, last, found = EncoderMonitor(DRIVE), None, []
+    for at_us in range(3_600_000_000, 3_603_000_000, 20_000):
+        doubt = monitor.look((0.0, 0.0), WheelAngles(0.0, 0.0, at_us // unit_us), at_us)
+        found.append(bool(doubt) == (last is not None and at_us // unit_us > last))
+        last = at_us // unit_us
+    assert all(found)
+
+
 def test_wheel_that_is_not_commanded_is_not_compared():
     """Not even with what was commanded before: an operator may have turned it by hand meanwhile."""
     assert not doubts_of(lambda _: 0.0, lambda true, at_s: true - 3 * at_s)
