@@ -23,7 +23,7 @@ from sightline.protocol.codec import decode
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import CameraModel, DetectedBox, Detections, DetectionsHeader, FrameHeader
 from sightline.vision_side.config import BoxesConfig
-from sightline.vision_side.detect.port import Circle, Detection
+from sightline.vision_side.detect.port import Circle, Detection, corners, is_normalized
 from sightline.vision_side.tracking.appearance import Look
 
 Column = NDArray[np.float64]
@@ -249,6 +249,8 @@ class BoxReader:
             raise WireError(RejectReason.MALFORMED, f"boxes of a {size} image, the camera delivers {own}")
         frame = self._frame_of(stamp)
         meant = [_detection(box) for box in found.boxes if self._means(box)]
+        if is_normalized(np.array([corners(one) for one in meant]).reshape(-1, 4)):
+            raise WireError(RejectReason.MALFORMED, "all boxes lie within two pixels of the corner, as if from 0 to 1")
         return frame, tuple(sorted(meant, key=lambda one: one.score, reverse=True))
 
     def _frame_of(self, stamp: DetectionsHeader) -> FrameHeader:

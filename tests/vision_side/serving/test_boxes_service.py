@@ -114,6 +114,20 @@ def test_no_answer_differs_from_an_empty_result():
     assert bench.twist()[0].angular_rad_s != 0 and any("searching" in line for line in bench.said)
 
 
+@pytest.mark.parametrize(("small", "count"), [(1.0, 0), (1.99, 0), (2.0, 1), (9.0, 1)])
+def test_boxes_from_0_to_1_steer_nothing_and_are_reported(small, count):
+    """Before, the robot turned to the upper left corner of the image."""
+    bench = Bench()
+    bench.frame(1)
+    bench.boxes(1, DetectedBox(label="ball", score=0.9, x1_px=0.2, y1_px=0.1, x2_px=small, y2_px=0.7), PERSON)
+    assert (bench.twist() is not None) is bool(count)
+    is_reported = any("rejecting boxes: all boxes lie within two pixels" in line for line in bench.said)
+    assert is_reported is not bool(count) and bench.service.skipped == ({} if count else {"MALFORMED": 1})
+    bench.frame(2)
+    bench.boxes(2, ball_at(1.6, 0.2))
+    assert bench.twist() is not None
+
+
 @pytest.mark.parametrize(("ahead_us", "refused"), [(400_000, ""), (600_000, "FROM_FUTURE")])
 def test_mission_is_not_of_the_future_because_boxes_of_old_frames_come(ahead_us, refused, monkeypatch):
     bench = Bench()
