@@ -584,6 +584,7 @@ def endpoints_text(config: VisionConfig) -> str:
 
 
 _BOXES_SILENCE_S = 2.0
+_MANY_RETURNS = 10
 _NO_BOXES = Observation("no boxes")
 
 
@@ -668,6 +669,9 @@ class BoxesService(Service):
             return
         self._rejected_boxes.use()
         self._log_change("boxes", f"boxes from {self._config.boxes.source}")
+        if self._reader.returns >= _MANY_RETURNS:  # while a robot changes services, both answer for a moment
+            self._log_change("senders", f"several services send boxes as {self._config.boxes.source}; end all but one, "
+                             "or start them with --share")
         waited_us = self._sessions.clock.age_us(frame.session, frame.t_us, self._now_us()) or 0
         self._mission_channel.prepare(self._pipeline, frame, waited_us)
         answer = self._pipeline.follow(frame, found)

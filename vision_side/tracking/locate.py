@@ -221,6 +221,9 @@ class BoxReader:
     def __init__(self, config: BoxesConfig) -> None:
         self._config = config
         self._frames: OrderedDict[tuple[str, int], FrameHeader] = OrderedDict()
+        self._senders = ("", "")
+        self.returns = 0
+        """Number of changes back to the service before the last one. A service that starts again is another one."""
 
     def remember(self, frame: FrameHeader) -> None:
         """Store a frame that boxes may name."""
@@ -248,10 +251,17 @@ class BoxReader:
             size, own = f"{found.width_px}x{found.height_px}", f"{camera.width_px}x{camera.height_px}"
             raise WireError(RejectReason.MALFORMED, f"boxes of a {size} image, the camera delivers {own}")
         frame = self._frame_of(stamp)
+        self._note_sender(stamp.session)
         meant = [_detection(box) for box in found.boxes if self._means(box)]
         if is_normalized(np.array([corners(one) for one in meant]).reshape(-1, 4)):
             raise WireError(RejectReason.MALFORMED, "all boxes lie within two pixels of the corner, as if from 0 to 1")
         return frame, tuple(sorted(meant, key=lambda one: one.score, reverse=True))
+
+    def _note_sender(self, session: str) -> None:
+        before, last = self._senders
+        if session != last:
+            self.returns += session == before
+            self._senders = last, session
 
     def _frame_of(self, stamp: DetectionsHeader) -> FrameHeader:
         echo = stamp.echo

@@ -68,12 +68,12 @@ class Bench:
         self.turn()
 
     def boxes(self, seq: int | None, *boxes: DetectedBox, source: str = "guest", number: int | None = None,
-              t_us: int | None = None) -> None:
+              t_us: int | None = None, session: str = "9999aaaa") -> None:
         self.sent += 1
         moment = seq * FRAME_US if seq is not None and t_us is None else t_us
         echo = None if seq is None else Echo(channel="frame", session="0000abcd", seq=seq, t_us=moment)
         number = self.sent if number is None else number
-        header = DetectionsHeader(source=source, session="9999aaaa", seq=number, echo=echo)
+        header = DetectionsHeader(source=source, session=session, seq=number, echo=echo)
         found = Detections(width_px=MODEL.width_px, height_px=MODEL.height_px, boxes=boxes)
         self.guest.publish(DETECTIONS, encode(header), encode(found), source)
         self.turn()
@@ -126,6 +126,19 @@ def test_boxes_from_0_to_1_steer_nothing_and_are_reported(small, count):
     bench.frame(2)
     bench.boxes(2, ball_at(1.6, 0.2))
     assert bench.twist() is not None
+
+
+@pytest.mark.parametrize(("senders", "lines"), [
+    ("a" * 40, 0), ("a" * 20 + "b" * 20, 0), ("abababab" + "b" * 40, 0), ("00112233445566778899aabbccddeeff", 0),
+    ("ab" * 20, 1), ("aab" * 10, 1), ("aabb" * 10, 1),
+])
+def test_several_services_of_one_name_are_reported_once_and_a_new_start_or_a_change_is_not(senders, lines):
+    """Before, the robot turned between their targets without a line."""
+    bench = Bench()
+    for seq, sender in enumerate(senders, 1):
+        bench.frame(seq)
+        bench.boxes(seq, ball_at(1.6, 0.2), session=sender * 8)
+    assert sum("several services send boxes as guest" in line for line in bench.said) == lines
 
 
 @pytest.mark.parametrize(("ahead_us", "refused"), [(400_000, ""), (600_000, "FROM_FUTURE")])
