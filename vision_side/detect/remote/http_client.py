@@ -217,6 +217,8 @@ class _Timed(io.RawIOBase):
 
     def readinto(self, buffer: Any, /) -> int:
         self._connection.settimeout(_left_s(self._until_us))
+        # A server that sends head and body apart may hold the body back until the head is acknowledged, for 40 ms.
+        self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
         count = self._connection.recv_into(buffer)
         self._taken_bytes += count
         if self._taken_bytes > _MAX_TAKEN_BYTES:

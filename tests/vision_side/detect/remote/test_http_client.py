@@ -9,8 +9,15 @@ import time
 import pytest
 
 from sightline.protocol.errors import ConfigError
+from sightline.vision_side.detect.remote import http_client
 from sightline.vision_side.detect.remote.client import ServerDetector, parse_address
-from sightline.vision_side.detect.remote.http_client import MAX_ANSWER_BYTES, RETRY_US, HttpJpeg, JpegServer
+from sightline.vision_side.detect.remote.http_client import (
+    MAX_ANSWER_BYTES,
+    RETRY_US,
+    HttpExchange,
+    HttpJpeg,
+    JpegServer,
+)
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_port
 from tests.fixtures.vision.remote import BALL_JPEG, GREY_JPEG, Server, box, frame, http_reply, said, within
@@ -97,6 +104,33 @@ def test_a_name_whose_first_address_is_of_a_family_that_this_machine_lacks_is_re
         there = (socket.AF_INET, socket.SOCK_STREAM, 6, "", ("127.0.0.1", server.port))
         monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: [lacking, there])
         assert _ask(_asking(server))
+
+
+class Pieces:
+    """A connection that delivers a reply in pieces. As in the kernel, an acknowledgment without delay lasts briefly."""
+
+    def __init__(self, pieces):
+        self.pieces, self.is_quick = list(pieces), False
+        self.settimeout = self.sendall = self.close = lambda *_: None
+
+    def setsockopt(self, level, option, value):
+        if (level, option) == (socket.IPPROTO_TCP, socket.TCP_QUICKACK):
+            self.is_quick = bool(value)
+
+    def recv_into(self, buffer):
+        assert self.is_quick
+        self.is_quick, piece = False, self.pieces.pop(0)
+        buffer[: len(piece)] = piece
+        return len(piece)
+
+
+@pytest.mark.parametrize("size", [1, 7, 60, 1000])
+def test_each_part_of_a_reply_is_acknowledged_immediately(size, monkeypatch):
+    """Otherwise a server that sends head and body apart waits 40 ms in between, e.g. each `http.server` of Python."""
+    connection = Pieces(GOOD[at : at + size] for at in range(0, len(GOOD), size))
+    monkeypatch.setattr(http_client, "_connected", lambda *_: connection)
+    exchange = HttpExchange("127.0.0.1", 1)
+    assert exchange.post("/", {}, b"", within(2.0)).body == said(box()) and not connection.pieces
 
 
 def test_unsolicited_reply_answers_no_later_frame():
