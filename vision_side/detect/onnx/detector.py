@@ -304,8 +304,9 @@ class OnnxDetector:
         wrong = difference(expected, found, least) if expected is not None else ""
         if wrong:
             where = f"{self._engine.device} ({self._engine.name})"
-            raise HardwareError(f"model {path.name} on {where} gives a wrong answer to its test image: "
-                                f"{wrong}; try --device cpu, or fetch the file again")
+            fix = "try --device cpu, or fetch the file again" if self._engine.device != "cpu" else (
+                f"fetch the file again, or remove {KEY!r} from the metadata of a model that you changed or quantized")
+            raise HardwareError(f"model {path.name} on {where} gives a wrong answer to its test image: {wrong}; {fix}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -67,6 +67,19 @@ def test_lost_gpu_gives_no_answer_and_never_uses_the_cpu(tmp_path: Path, monkeyp
     assert "CUDA failure" in eye.notices()[0]
 
 
+@pytest.mark.parametrize(("device", "fix"), [
+    ("cuda", "try --device cpu, or fetch the file again"), ("cpu", "fetch the file again, or remove 'golden' from"),
+])
+def test_fix_of_a_wrong_answer_fits_the_device(tmp_path: Path, monkeypatch, device: str, fix: str) -> None:
+    """Before, a quantized model on the CPU was to run on the CPU."""
+    monkeypatch.setitem(__import__("sys").modules, "onnxruntime", _Dying)
+    golden = {"labels": '["ball"]', "golden": '[[30, 30, 90, 90, 0.9, "ball"]]'}
+    given = SimpleNamespace(custom_metadata_map=golden)
+    monkeypatch.setattr(_Dying.InferenceSession, "get_modelmeta", lambda _: given)
+    with pytest.raises(HardwareError, match=rf"on {device} \(.* is missing; {fix}"):
+        detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]), device=device)
+
+
 def test_real_runtime_can_stay_on_its_device(tmp_path: Path) -> None:
     eye = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]))
     assert eye._engine._session._enable_fallback is False
