@@ -388,7 +388,7 @@ def main(setup: dict[str, Any]) -> None:
     ctypes.CDLL(None).prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)  # children of a dead driver process come to this one
     try:
         guardian = Guardian(setup)
-    except Exception as error:
+    except BaseException as error:  # third-party code; signals are blocked
         _log.error("robot %s: the guardian does not start: %s: %s", setup["robot"], type(error).__name__, error)
         sys.exit(1)
     for _ in request_real_time(GUARDIAN_PRIORITY):

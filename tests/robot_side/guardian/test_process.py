@@ -35,9 +35,11 @@ GUARDIAN_OF_A_DEAD_DRIVER = """
 import os, signal, socket
 from sightline.robot_side.guardian import process
 
-def zero(config):
-    raise {}("broken")
+def fail(part):
+    if part == "{}":
+        raise {}("broken")
 
+prepare, zero = lambda: fail("prepare"), lambda config: fail("zero")
 driver = os.fork()
 if not driver:
     signal.pause()
@@ -124,11 +126,15 @@ def test_zero_that_fails_is_reported_and_the_next_driver_stops_the_wheels(dying,
 
 
 @pytest.mark.parametrize("error", ["SystemExit", "KeyboardInterrupt", "GeneratorExit", "OSError"])
-def test_zero_that_raises_anything_leaves_motors_that_are_not_set_to_zero(error):
-    command = [sys.executable, "-c", GUARDIAN_OF_A_DEAD_DRIVER.format(error)]
+@pytest.mark.parametrize(("part", "line", "code"), [
+    ("prepare", "the guardian does not start: {}: broken", 1),
+    ("zero", "motors NOT set to zero: {}: broken; switch off their supply", 3),
+])
+def test_whatever_a_drive_raises_in_the_guardian_is_one_line_and_no_success(part, line, code, error):
+    command = [sys.executable, "-c", GUARDIAN_OF_A_DEAD_DRIVER.format(part, error)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=START_S, check=False)
-    assert f"motors NOT set to zero: {error}: broken; switch off their supply" in done.stderr
-    assert "motors are set to zero" not in done.stdout and done.returncode == 3
+    assert line.format(error) in done.stderr and done.returncode == code
+    assert "motors are set to zero" not in done.stdout
 
 
 def test_robot_whose_drive_is_gone_shows_why_and_drives_again_when_it_is_back(dying):
