@@ -219,7 +219,7 @@ def test_robot_with_a_fast_camera_widens_its_window_on_a_long_link(monkeypatch, 
 
 
 @pytest.mark.parametrize("delay_us", [80_000, 150_000])
-@pytest.mark.parametrize("name", ["R-FLOW-14", "R-RECO-04"])
+@pytest.mark.parametrize("name", ["R-FLOW-08", "R-FLOW-14", "R-RECO-04"])
 def test_our_robot_passes_over_a_slow_link(monkeypatch, name, delay_us):
     monkeypatch.setattr(reference, "MemoryNetwork", lambda: MemoryNetwork(delay_us=delay_us))
     result = result_of(CASES_BY_ID[name])
