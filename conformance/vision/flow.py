@@ -145,7 +145,7 @@ def _goes_on(status: Status | bytes, what: str, robot: RobotPlayed, *, twists: b
     bench.rest(250_000)
     for _ in range(8):
         sent = robot.frame("left")
-        good = robot.is_driven(sent) if twists else robot.is_answered(sent)
+        good = robot.is_driven(sent, within_us=_PATIENCE_US) if twists else robot.is_answered(sent, _PATIENCE_US)
         if not robot.answers_to(sent):
             robot.need_nothing_dropped()
         bench.expect(good, f"no {'twist' if twists else 'answer'} for frame {sent.seq} {what}")
