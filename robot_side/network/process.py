@@ -378,7 +378,7 @@ def main() -> None:
         else:  # the normal end of the program
             logging.shutdown()
             print(error_line(str(error)), file=sys.stderr)
-    except Exception as error:
+    except BaseException as error:  # also of a plug-in: signals are ignored
         report_fault("network process", error)
         driver.send(ipc.pack_counts(ipc.PacketKind.FAULTS, {"network process": 1}))
     finally:

@@ -1,5 +1,6 @@
 """The network process: the driver process knows a frame before it leaves, and one thread at a time uses the credit."""
 
+import itertools
 import signal
 import socket
 import subprocess
@@ -12,15 +13,18 @@ import pytest
 
 from sightline.protocol.channels import ACK, CAMERA, FRAME
 from sightline.protocol.codec import decode, encode
+from sightline.protocol.config import Config
 from sightline.protocol.messages import AnswerHeader, CameraModel, Echo, FrameHeader, Holder, StreamStatus
 from sightline.protocol.transports.link import Message
 from sightline.robot_side import pipe as ipc
-from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS
 from sightline.robot_side.network import process as network_process
 from sightline.robot_side.network.process import NetworkProcess
 from sightline.robot_side.pipe import DriverEnd, NetworkEnd, NetworkSetup
 from sightline.robot_side.ports import Picture
+from tests.fixtures.links import START_S, until
+from tests.fixtures.ports import free_endpoint
 
 ROBOT = "0000000a"
 MODEL = CameraModel(width_px=320, height_px=240, fx_px=200.0, fy_px=200.0, cx_px=160.0, cy_px=120.0)
@@ -294,3 +298,29 @@ def test_signal_during_a_start_of_the_network_process_does_not_end_it(tmp_path, 
     assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before, "the driver gets its keys again"
     started.kill()
     driver_end.close()
+
+
+class OddCamera:
+    """Its library ends the program, or is interrupted."""
+
+    class Config(Config):
+        """The error."""
+
+        error: str
+
+    def __init__(self, config):
+        raise {"KeyboardInterrupt": KeyboardInterrupt, "SystemExit": SystemExit}[config.error]("odd")
+
+
+@pytest.mark.parametrize("error", ["KeyboardInterrupt", "SystemExit"])
+def test_start_that_a_camera_ends_names_its_exception(tmp_path, capfd, error):
+    camera = PluginChoice(kind=f"{__name__}:OddCamera", options={"error": error})
+    end = DriverEnd(RobotConfig(listen=(free_endpoint(),), state_dir=tmp_path, camera=camera), "00000001")
+    now_us = itertools.count(0, 20_000)
+
+    def failed():
+        end.keep_alive(next(now_us), 0)
+        return not list(end.packets()) and end.failed_at_start
+
+    assert until(failed, START_S)
+    assert end.exit_code and f"raised {error}: odd" in capfd.readouterr().err
