@@ -52,7 +52,7 @@ def test_stop_by_datagram_passes_while_the_kit_has_no_processor(monkeypatch, nam
 
 
 @pytest.mark.waits
-def test_stop_port_passes_over_a_link_of_80_ms(monkeypatch):
+def test_stop_port_passes_over_a_slow_link(monkeypatch):
     send = RawStopPort.send
     monkeypatch.setattr(RawStopPort, "send", lambda *arguments: Timer(0.16, send, arguments).start())
     with small_server(guarded=True) as (bench, prepare):

@@ -47,6 +47,9 @@ class VirtualLoop:
     def keep_alive(self, now_us, first_seq):
         pass
 
+    def is_start_due(self, now_us):
+        return False
+
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
