@@ -243,6 +243,10 @@ def check(
     if times and not any(one.boxes for one in times):
         notices.append("it found nothing in the drawn images, so that no box was checked; look at its boxes in images "
                        f"of yours: `sightline vision --dry-run --camera v4l2 --detector {shlex.quote(name)}`")
+    deadline_s = settings.detector.deadline_s
+    if any(one.p50_ms > deadline_s * 1000 and getattr(made[-1], "waits", False) for one in times):
+        notices.append(f"most answers take longer than detector.deadline_s, {deadline_s:g} s, and would not count; use "
+                       "a faster server or a longer deadline")
     report = _as_json(name, ok, results, times) | {"notices": notices}
     return print_result(report, [_as_text(name, results, times, notices)], as_json)
 

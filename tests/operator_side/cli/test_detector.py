@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -218,6 +219,29 @@ def test_every_mistake_is_one_line(capsys, arguments: tuple[str, ...], code: int
 def test_notices_of_a_checked_detector_are_shown(capsys) -> None:
     code, out, _ = run(capsys, "detector", "check", "http+jpeg://127.0.0.1:1/eyes")
     assert code == 5 and "FAIL  Every image" in out and "note: " in out and "UNREACHABLE" in out
+
+
+class Distant(Hsv):
+    """A detector on another machine, with 150 ms for each image."""
+
+    waits = True
+
+    def detect(self, frames, deadline_us):
+        return [one and replace(one, compute_us=150_000) for one in super().detect(frames, deadline_us)]
+
+
+class Slow(Distant):
+    waits = False
+
+
+@pytest.mark.parametrize(("name", "deadline_s", "count"), [
+    ("Distant", 0.1, 1), ("Distant", 0.149, 1), ("Distant", 0.2, 0), ("Slow", 0.1, 0),
+])
+def test_check_warns_of_a_remote_detector_that_is_too_slow_for_the_deadline(capsys, tmp_path, name, deadline_s, count):
+    """Before, it was fine in the check, and gave no answer to any frame of a robot."""
+    (tmp_path / "vision.toml").write_text(f"[detector]\ndeadline_s = {deadline_s}\n")
+    code, out, _ = run(capsys, "detector", "check", f"{__name__}:{name}", "--config", str(tmp_path / "vision.toml"))
+    assert code == 0 and out.count(f"longer than detector.deadline_s, {deadline_s:g} s") == count
 
 
 def test_an_option_of_a_section_is_set_by_a_dot() -> None:
