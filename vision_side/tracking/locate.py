@@ -221,7 +221,7 @@ class BoxReader:
     def __init__(self, config: BoxesConfig) -> None:
         self._config = config
         self._frames: OrderedDict[tuple[str, int], FrameHeader] = OrderedDict()
-        self._senders = ("", "")
+        self._senders: tuple[str | None, str | None] = (None, None)
         self.returns = 0
         """Number of changes back to the service before the last one. A service that starts again is another one."""
 
@@ -253,7 +253,7 @@ class BoxReader:
         frame = self._frame_of(stamp)
         self._note_sender(stamp.session)
         meant = [_detection(box) for box in found.boxes if self._means(box)]
-        if is_normalized(np.array([corners(one) for one in meant]).reshape(-1, 4)):
+        if is_normalized(np.array([corners(one) for one in meant]).reshape(len(meant), 4)):
             raise WireError(RejectReason.MALFORMED, "all boxes lie within two pixels of the corner, as if from 0 to 1")
         return frame, tuple(sorted(meant, key=lambda one: one.score, reverse=True))
 

@@ -360,10 +360,10 @@ def frame(seq=3, t_us=30, session=ROBOT):
     return FrameHeader(session=session, seq=seq, t_us=t_us)
 
 
-def boxes(*found, size=(640, 480), echo="same", channel="frame", **changes):
+def boxes(*found, size=(640, 480), echo="same", channel="frame", sender="0000000b", **changes):
     named = {"session": ROBOT, "seq": 3, "t_us": 30, **changes}
     echo = Echo(channel=channel, **named) if echo == "same" else echo
-    header = DetectionsHeader(source="guest", session="0000000b", seq=1, echo=echo)
+    header = DetectionsHeader(source="guest", session=sender, seq=1, echo=echo)
     return encode(header), encode(Detections(width_px=size[0], height_px=size[1], boxes=found))
 
 
@@ -409,6 +409,28 @@ def test_boxes_of_another_size_or_frame_are_rejected(changes, reason, detail):
     with pytest.raises(WireError) as error:
         reader().read(*boxes(box(), **changes), CAMERA)
     assert error.value.reason == reason and error.value.detail.startswith(detail)
+
+
+@pytest.mark.parametrize(("ends_px", "is_rejected"), [((1.0,), True), ((1.99, 0.5), True), ((2.0, 1.0), False)])
+def test_boxes_in_the_corner_are_rejected_as_boxes_from_0_to_1(ends_px, is_rejected):
+    found = [box().model_copy(update={"x1_px": 0.0, "y1_px": 0.0, "x2_px": end, "y2_px": end}) for end in ends_px]
+    if not is_rejected:
+        assert len(reader().read(*boxes(*found), CAMERA)[1]) == len(found)
+        return
+    with pytest.raises(WireError) as error:
+        reader().read(*boxes(*found), CAMERA)
+    assert (error.value.reason, error.value.detail) == (
+        "MALFORMED", "all boxes lie within two pixels of the corner, as if from 0 to 1")
+
+
+@pytest.mark.parametrize(("senders", "returns"), [
+    ("a", 0), ("aaa", 0), ("ab", 0), ("aabbcc", 0), ("aba", 1), ("aabba", 1), ("abab", 2), ("abbaacca", 2), ("abca", 0),
+])
+def test_changes_back_to_the_service_before_the_last_one_are_counted(senders, returns):
+    made = reader()
+    for sender in senders:
+        made.read(*boxes(sender=f"0000000{sender}"), CAMERA)
+    assert made.returns == returns
 
 
 def test_the_last_128_frames_are_remembered():
