@@ -32,6 +32,17 @@ def test_only_waits(): time.sleep(0.2)
 @pytest.mark.slow
 def test_of_the_second_tier_computes(): exec(COMPUTE)
 def test_fails_by_itself(): exec(COMPUTE); assert False
+
+@pytest.fixture(scope="session")
+def shared_child():
+    with subprocess.Popen([sys.executable, "-S", "-c", COMPUTE + "\\nprint(flush=True); input()"],
+                          stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        child.stdout.readline()
+        yield
+
+@pytest.mark.slow
+def test_of_the_second_tier_starts_a_shared_child_that_computes(shared_child): pass
+def test_is_not_charged_for_a_shared_child_that_ends_with_it(): pass
 """
 
 
@@ -57,9 +68,9 @@ def test_where_cpu_is_demanded_a_test_of_the_first_tier_that_computes_fails(tmp_
 
 def test_where_it_is_not_demanded_the_slowest_are_only_named(tmp_path):
     done = run(tmp_path, "node")
-    assert "ERROR" not in done.stdout and "4 passed" in done.stdout
+    assert "ERROR" not in done.stdout and "6 passed" in done.stdout
     slowest = re.search(r"^most CPU time: 0\.\d+ s .*", done.stdout, re.MULTILINE)[0]
-    assert slowest.count("test_it.py::") == 4 and "test_only_waits" not in slowest
+    assert slowest.count("test_it.py::") == 5 and "waits" not in slowest and "charged" not in slowest
 
 
 def _a_little():
