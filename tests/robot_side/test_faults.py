@@ -10,6 +10,7 @@ import pytest
 
 from sightline.protocol import log
 from sightline.protocol.channels import STATUS
+from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode
 from sightline.protocol.config import Config
 from sightline.protocol.errors import HardwareError
@@ -98,7 +99,8 @@ def test_exceptions_of_drive_and_range_sensor_are_in_the_status(driver, caplog, 
 def test_a_doubtful_encoder_is_counted_each_time_and_logged_ever_more_rarely(driver, caplog, monkeypatch):  # noqa: F811
     monkeypatch.setattr(driver.driver_end, "keep_alive", lambda *_: None)
     times = itertools.count()
-    readings = [WheelAngles(0.0, 1000.0 * (turn % 2), 20_000 * turn) for turn in range(5)]
+    now_us = monotonic_us()
+    readings = [WheelAngles(0.0, 1000.0 * (turn % 2), now_us + 20_000 * turn) for turn in range(5)]
     monkeypatch.setattr(driver._drive, "wheels", lambda: readings[next(times) % 5])
     for turn in range(4):
         driver._tick(20_000 * turn)
