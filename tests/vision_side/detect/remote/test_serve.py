@@ -88,8 +88,9 @@ def test_robots_of_a_killed_service_move_to_another_and_no_frame_is_examined_twi
     assert load.gap_us < 4_000 * LONGEST_GAP_MS
 
 
+@pytest.mark.alone
 def test_overloaded_service_serves_streams_fairly_and_in_time(tmp_path):
     load = measure_streams(free_endpoint(), tmp_path, StreamPlan(streams=8, seconds=4))
     assert len(load.answered) == 8 and load.overload > 1.5
-    # Wide bounds, because other tests load this machine. `sightline bench streams` has the strict ones.
+    # Wide bounds for a slow machine. `sightline bench streams` has the strict ones.
     assert load.p95_ms <= 2 * DEADLINE_MS and load.unfair_percent <= 25
