@@ -74,8 +74,11 @@ def test_forked_child_gets_other_ports():
     mine, (reader, writer) = free_port(), os.pipe()
     child = os.fork()
     if not child:
-        os.write(writer, f"{free_port()}\n".encode())
-        signal.pause()  # its block is free for others once it has ended
+        try:
+            os.write(writer, f"{free_port()}\n".encode())
+            signal.pause()  # its block is free for others once it has ended
+        finally:
+            os._exit(1)  # an exception must not continue the session of the parent
     os.close(writer)
     try:
         with os.fdopen(reader) as text:
