@@ -93,3 +93,19 @@ def test_a_slower_machine_has_a_higher_bound(monkeypatch):
     item = type("Item", (), {"nodeid": "x", "get_closest_marker": lambda self, name: None})()
     monkeypatch.setattr(cpu_times, "slowness", lambda: 1.9)
     assert CpuTimes()._complaint(item, 2.8) == "" and "at most 1.5 s" in CpuTimes()._complaint(item, 2.9)
+
+
+@pytest.mark.parametrize("error", [FileNotFoundError, ProcessLookupError])
+def test_thread_that_ends_while_children_are_counted_is_no_error(monkeypatch, error):
+    from tests.fixtures.cpu_times import cpu_s
+
+    read, ended = Path.read_text, []
+
+    def ends_once(path):
+        if path.name == "children" and not ended:
+            ended.append(path)
+            raise error
+        return read(path)
+
+    monkeypatch.setattr(Path, "read_text", ends_once)
+    assert 0 < cpu_s() <= cpu_s() and len(ended) == 1
