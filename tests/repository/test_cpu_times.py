@@ -96,7 +96,7 @@ def test_a_slower_machine_has_a_higher_bound(monkeypatch):
 
 
 @pytest.mark.parametrize("error", [FileNotFoundError, ProcessLookupError])
-def test_thread_that_ends_while_children_are_counted_is_no_error(monkeypatch, error):
+def test_thread_may_end_while_children_are_counted(monkeypatch, error):
     from tests.fixtures.cpu_times import cpu_s
 
     read, ended = Path.read_text, []

@@ -193,10 +193,10 @@ def report_for(process, seconds, *, begin_us):
 def test_stopped_receiver_is_logged_and_started_again(started, operator, caplog):
     address = ("127.0.0.1", free_port())
     process = started(stop_receiver.start("r1", [address], [], ""))
-    driver, begin_us = Driver(process), now_us() + 1_000_000
+    driver, begin_us = Driver(process), now_us() + 3_000_000
     assert stop(operator, address, driver, StopRequests("r1", b"", 7))
     assert until(lambda: process._unread_bytes() == 0, START_S)
-    process.keep_alive(begin_us - 1_000)
+    process.keep_alive(begin_us - 1_000_000)
     stopped = process._process
     stopped.send_signal(signal.SIGSTOP)
     report_for(process, 6, begin_us=begin_us)
