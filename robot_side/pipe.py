@@ -377,7 +377,7 @@ class DriverEnd:
             return
         if code == CAMERA_EXIT:  # later each time, because a restart also interrupts the link
             self._camera_patience_us = min(2 * self._camera_patience_us, _LONGEST_PATIENCE_US)
-        why = "silent for 2 s" if self._hung else "camera" if code == CAMERA_EXIT else code
+        why = "stopped or hung" if self._hung else "camera" if code == CAMERA_EXIT else code
         _log.info("network process ended (%s); starting it again", why)
         self._start_at_us = now_us + self._backoff_us
         self._backoff_us = min(2 * self._backoff_us, _LONGEST_BACKOFF_US)
