@@ -255,17 +255,18 @@ def _stop_offline(rig: RobotFixture) -> Injected:
     """Run `sightline stop` while the legacy robot applies nothing, as without Wi-Fi. It cannot stop, and no line may
     claim that it did.
     """
-    at_us = monotonic_us()
+    began_us = monotonic_us()
     rig.processes.signal("robot", signal.SIGSTOP)
     rig.processes.start("stop", ["stop", ROBOT, "--connect", rig.endpoint])
     code = rig.processes.exit_code("stop", STOP_ENDS_S)
     printed = rig.processes.log("stop").read_text("utf-8")
-    return Injected(1, at_us, checks=(
+    # Until here it keeps its speed. No general rule may count that, whenever its last command reached the motors.
+    return Injected(1, monotonic_us(), checks=(
         at_least("speed that the robot keeps", wheel_mps(rig.motors()[-1]), "m/s", rig.setup.kept_mps),
         at_least(f"exit code {LinkError.exit_code}", code == LinkError.exit_code, "", 1),
         at_least("line to cut its power", CUT_ITS_POWER in printed, "", 1),
         at_most("line that it stopped", "stopped" in printed.lower(), "", 0),
-    ))
+    ), from_us=began_us)
 
 
 _FORMATS: Final = {

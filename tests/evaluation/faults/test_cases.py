@@ -49,7 +49,7 @@ from sightline.evaluation.faults.sampler import STALL_US, Hole, read_holes, stal
 from sightline.operator_side.cli import evaluate as cli_faults
 from sightline.protocol.channels import REQUEST, TWIST
 from sightline.protocol.clock import monotonic_us
-from sightline.protocol.errors import ConfigError, WireError
+from sightline.protocol.errors import ConfigError, LinkError, WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.text import parse_twist
 from sightline.robot_side.kinematics import DiffDriveConfig
@@ -194,6 +194,20 @@ def test_row_without_a_stop_counts_a_speed_that_lasts_until_its_end(monkeypatch,
     rig = SimpleNamespace(motors=lambda: log([0.5] * 51), sent=lambda: commands(1_000_000))
     row = FaultCase("x", "x", lambda _rig: Injected(1, 0), Setup(), stops=False)
     assert [one.ok for one in runner._motion_checks(row, rig, Injected(1, 0))] == [ok]
+
+
+def test_speed_of_a_legacy_robot_out_of_reach_does_not_count_as_driven_on_an_old_frame(monkeypatch, tmp_path):
+    (tmp_path / "log").write_text(stop_cases.CUT_ITS_POWER)
+    clock = iter([500_000, 11_000_000])
+    monkeypatch.setattr(stop_cases, "monotonic_us", lambda: next(clock))
+    monkeypatch.setattr(runner, "monotonic_us", lambda: 11_100_000)
+    processes = SimpleNamespace(signal=lambda *_: None, start=lambda *_: None, exit_code=lambda *_: LinkError.exit_code,
+                                log=lambda _: tmp_path / "log")
+    [case] = chosen(["legacy.stop_offline"], short=False)
+    rig = SimpleNamespace(processes=processes, endpoint="", setup=case.setup,  # its last line is later than the signal
+                          motors=lambda: log([0.5] * 27), sent=lambda: commands(500_000))
+    injected = case.inject(rig)
+    assert [one.name for one in (*runner._motion_checks(case, rig, injected), *injected.checks) if not one.ok] == []
 
 
 def test_only_a_long_pause_from_the_fault_on_counts_as_a_held_speed():
