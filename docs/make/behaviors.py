@@ -503,7 +503,7 @@ def write_page(
     results, speeds = _run_all(wanted, wishes, shown, jobs)
     if speeds:
         plot_speeds(pictures / SPEEDS, speeds)
-    text = "\n".join(page_lines(rows, results, seeds, pictures.name, speeds, tables=tables)) + "\n"
+    text = "\n".join(page_lines(rows, results, seeds, pictures.name, speeds, tables=tables)).rstrip() + "\n"
     page.write_text(merged(page.read_text("utf-8"), text) if only else text, "utf-8")
     return all(kept(row, results, seeds) for row in rows) and "**not kept**" not in text
 
