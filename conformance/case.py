@@ -237,6 +237,8 @@ class Bench(ABC):
         """Returns the rows of the robot's motor log so far; empty without a log."""
         self.played: dict[str, object] = {}
         """Peers that the kit plays, by the digest of their session. A robot shows only the digest of a driver."""
+        self.link_us: int | None = None
+        """Delay of a reply over the link beyond that of a fast link. None: not measured yet."""
         self._log: dict[str, deque[Received]] = {}
         self._reactions: list[tuple[Channel, Callable[[Received], None]]] = []
         self._timers: list[tuple[int, int, Callable[[], None]]] = []

@@ -13,6 +13,7 @@ from sightline.conformance.robot.fixture import (
     Sender,
     arm,
     armed,
+    is_arm_granted,
     moving,
     operator,
     ready,
@@ -25,7 +26,8 @@ _WHEELS_STOP_US: Final = 700_000 + SETTLES_US
 """From STOP until the wheels are measured at rest."""
 _LOST_US: Final = 1_300_000
 """Silence after which a human's lease has ended, while the cited status is younger than two seconds."""
-
+_LEASE_LASTS_US: Final = 850_000
+"""Since the last twist of a human, so that a request arrives within the second of the lease."""
 _YOUNG_US: Final = 1_800_000
 """Age below which a request that cites a `status`, sent after the next one, is not older than two seconds."""
 
@@ -297,7 +299,7 @@ def arming_waits_for_the_wheels(bench: Bench, driver: Sender) -> None:
     turned = False
     while driver.robot.status().applied != (0.0, 0.0):
         reply = operator.reply("arm")
-        turns = driver.robot.next_status().applied != (0.0, 0.0)
+        turns = driver.robot.newer_status().applied != (0.0, 0.0)
         bench.expect(not (reply.ok and turns), "it was granted while the wheels turned")
         turned = turned or turns
     bench.need(turned, "its wheels are at zero before a `status` shows DISARMED")
@@ -310,7 +312,7 @@ def reset_waits_for_the_wheels(bench: Bench, driver: Sender) -> None:
     operator.send_request("stop")
     bench.need(driver.robot.becomes(State.STOPPED), "STOP does not stop this robot (R-STOP-01)")
     before, reply = driver.robot.status(), operator.reply("reset")
-    after = driver.robot.next_status()
+    after = driver.robot.newer_status()
     bench.need(after.applied != (0.0, 0.0) or not reply.ok, "its wheels are at zero before a `status` shows STOPPED")
     bench.expect(not reply.ok, "it was granted while the wheels turned")
     counted = driver.robot.counts("NOT_ALLOWED", before.refused.get("NOT_ALLOWED", 0))
@@ -321,7 +323,8 @@ def reset_waits_for_the_wheels(bench: Bench, driver: Sender) -> None:
 def reset_beside_a_human(bench: Bench, human: Sender) -> None:
     """While a human holds the lease, no other source may reset: NOT_ALLOWED."""
     operator = _stopped(bench)
-    bench.need(human.robot.status().holder is not None, "the lease of the human has ended")
+    held = human.robot.status().holder is not None and bench.now_us - human.sent_us < _LEASE_LASTS_US
+    bench.need(held, "the lease of the human has ended")
     operator.expect_rejected("reset", "NOT_ALLOWED", "a request while a human drives")
 
 
@@ -443,5 +446,5 @@ def arms_after_reset(bench: Bench, first: Sender) -> None:
     driver.drive()
     _send_more(driver, 8)
     driver.robot.next_status()
-    bench.expect(driver.granted("arm"), "arm is not granted after reset")
+    bench.expect(is_arm_granted(driver), "arm is not granted after reset")
     arm(driver)

@@ -14,7 +14,7 @@ from sightline.conformance.robot import (
     twists,
     websocket,
 )
-from sightline.conformance.robot.fixture import Robot, Sender
+from sightline.conformance.robot.fixture import FAST_LINK_US, REPLY_US, Robot, Sender
 from sightline.protocol.channels import STATUS
 from sightline.protocol.messages import State, Status
 
@@ -23,6 +23,10 @@ _SETTLES_US: Final = 6_000_000
 _FIRST_US: Final = 5_000_000
 _COASTS_US: Final = 500_000
 """Wheels with the command zero may turn a little longer. If they continue, the cases about that fail."""
+_MEASURED: Final = 3
+"""Requests over a slow link: a single one may be late for another reason."""
+_MOST_LINK_US: Final = 300_000
+"""A robot that is slower than that gets no more time."""
 _ORDER: Final = tuple(GROUPS)
 
 CASES: Final[tuple[Case, ...]] = tuple(
@@ -56,7 +60,23 @@ def prepare(bench: Bench) -> None:
     else:
         raise ConformanceError("before the case the robot could not be brought to DISARMED, without holder, at zero")
     bench.wait(lambda: robot.evidence_of_motion(robot.clock_us() - _COASTS_US) is None, _COASTS_US)
+    if bench.link_us is None:
+        bench.link_us = _measured_link_us(operator)
     bench.forget()
+
+
+def _measured_link_us(operator: Sender) -> int:
+    """Return the time above `FAST_LINK_US` until the reply to a request that changes nothing; 0 without a reply."""
+    fastest_us = _MOST_LINK_US
+    for _ in range(_MEASURED):
+        sent_us = operator.bench.now_us
+        if operator.request("disarm") is None:
+            operator.bench.rest(REPLY_US)  # a later reply must not look like one to the case
+            return 0
+        fastest_us = min(fastest_us, operator.bench.now_us - sent_us - FAST_LINK_US)
+        if fastest_us <= 0:
+            return 0
+    return fastest_us
 
 
 def _release(robot: Robot) -> None:

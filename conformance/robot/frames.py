@@ -7,7 +7,7 @@ from statistics import median
 from typing import Final
 
 from sightline.conformance.case import Bench, Received, Suite
-from sightline.conformance.robot.fixture import Robot, Sender, armed, ready, vision
+from sightline.conformance.robot.fixture import FAST_LINK_US, Robot, Sender, armed, ready, vision
 from sightline.protocol.channels import (
     CAMERA,
     CHANNELS,
@@ -164,6 +164,7 @@ def applied_in_frames(bench: Bench, driver: Sender) -> None:
 def latency_in_frames(bench: Bench, driver: Sender) -> None:
     """`latency_us` of a frame, where it is given, is the time from capture to the acceptance of the last command."""
     reported: list[int] = []
+    bench.need(driver.robot.link_us() <= _SHORT_US, "over this link, answers after 120 ms come too late")
     for delay_us in (20_000, 120_000):
         driver.delay_us = driver.compute_us = delay_us
         bench.rest(1_000_000)
@@ -248,6 +249,10 @@ SLOW_US: Final = 90_000
 """A slow detector: some frames at 30 fps."""
 _LATE_US: Final = 180_000
 """Delay at which an image that waited for the answer differs from one taken after it."""
+_SHORT_US: Final = 200_000
+"""Delay of a link at which a robot accepts answers after 120 ms."""
+_LONG_US: Final = 110_000
+"""Delay of a link, and of the kit's answers in addition, at which more than one frame is in flight."""
 OWNED_US: Final = 1_600_000
 """A peer owns the credit for a second after its last answer; so does the peer of the last case."""
 TAUGHT: Final = 14
@@ -360,6 +365,8 @@ def rejected_twists_return_credit(bench: Bench, watcher: Sender) -> None:
     watcher.robot.each_frame(lambda frame: bench.after(SLOW_US, partial(rejected.twist, frame, seq=5)))
     by_twists = _gap_us(bench, "with rejected twists")
     reported = f"a frame each {by_twists / 1e3:.0f} ms with OUT_OF_ORDER twists, {by_acks / 1e3:.0f} ms with acks"
+    steady = by_twists <= _LONGER * by_acks or watcher.robot.link_us() < _LONG_US - FAST_LINK_US
+    bench.need(steady, f"{reported}: over this link, the window is not steady")
     bench.expect(by_twists <= _LONGER * by_acks, reported)
 
 
@@ -392,10 +399,10 @@ def long_link_widens(bench: Bench, watcher: Sender) -> None:
     """On a link that takes 100 ms, more than one frame is in flight."""
     bench.rest(OWNED_US)
     quick = _quick_fps(bench)
-    watcher.delay_us = 110_000
+    watcher.delay_us = max(0, _LONG_US - watcher.robot.link_us())
     bench.rest(2_500_000)
-    fps = fps_of(bench)
-    bench.expect(fps >= 1.5e6 / 110_000, f"{fps:.0f} fps over 110 ms, {quick:.0f} without delay")
+    fps, long_us = fps_of(bench), max(_LONG_US, watcher.robot.link_us())
+    bench.expect(fps >= 1.5e6 / long_us, f"{fps:.0f} fps over {long_us // 1000} ms, {quick:.0f} without delay")
 
 
 @SUITE.must("R-FLOW-08", "7.2 Credit", vision)
@@ -403,7 +410,7 @@ def answers_count_for_older(bench: Bench, watcher: Sender) -> None:
     """An answer returns the credit of its frame and of all older ones."""
     bench.rest(OWNED_US)
     interval_us = round(1e6 / _quick_fps(bench))
-    watcher.delay_us = 300_000
+    watcher.delay_us = 300_000 - min(300_000, watcher.robot.link_us())
     bench.rest(5_000_000)
     fps = fps_of(bench)
     bench.need(fps >= 9, f"{fps:.0f} fps over 300 ms: the window is not wide (R-FLOW-07)")

@@ -15,6 +15,7 @@ from sightline.conformance.robot.fixture import (
     Sender,
     armed,
     as_json,
+    is_arm_granted,
     ready,
     vision,
     watcher,
@@ -110,10 +111,7 @@ def _sending_guest(bench: Bench) -> _Guest:
 def _drives(guest: _Guest) -> bool:
     """Arm the robot for a guest. Returns True if the robot follows it."""
     robot = guest.watcher.robot
-    for _ in range(5):
-        if guest.watcher.granted("arm"):
-            break
-        robot.bench.rest(200_000)
+    is_arm_granted(guest.watcher)
     return robot.becomes(*DRIVEN, within_us=1_500_000)
 
 
@@ -234,6 +232,7 @@ def _survives(sender: Sender, *messages: tuple[bytes, bytes]) -> None:
             bench.rest(30_000)
     mark = bench.mark()
     bench.expect_within(lambda: len(bench.received(STATUS, mark)) >= 3, 1_500_000, "after it the robot is silent")
+    bench.rest(sender.robot.link_us())
     sender.expect(GOOD, what="after it an ordinary twist")
 
 

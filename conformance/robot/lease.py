@@ -129,6 +129,7 @@ def rejected_twists_renew_nothing(bench: Bench, first: Sender) -> None:
         first.twist(frame, seq=1)
         first.twist(old)
         bench.rest(200_000)
+    bench.rest(first.robot.link_us())
     Sender(first.robot).expect(GOOD, what="after 1.4 s of rejected twists a second driver")
 
 
@@ -224,7 +225,7 @@ def lease_is_one_second(bench: Bench, first: Sender) -> None:
     first.fall_silent()
     bench.need(robot.reaches(lambda status: status.holder is None, 2_500_000), "the lease does not end (R-LEASE-04)")
     lasted_us = robot.stamp().t_us - sent_us
-    lasts = _LEASE_US * 9 // 10 <= lasted_us <= _LEASE_US + _NOTICED_US
+    lasts = _LEASE_US * 9 // 10 <= lasted_us <= _LEASE_US + _NOTICED_US + robot.link_us()
     bench.expect(lasts, f"`status` named it for {lasted_us / 1e6:.2f} s")
 
 
@@ -241,13 +242,13 @@ def acquire_does_not_renew(bench: Bench, sender: Sender) -> None:
     """Requesting again does not keep the lease alive without twists."""
     sender.acks = False
     bench.rest(_LEASE_US * 3 // 2)
-    bench.need(sender.granted("acquire"), "acquire is not granted (R-LEASE-13)")
     began_us = bench.now_us
-    while bench.now_us - began_us < 800_000:
+    bench.need(sender.granted("acquire"), "acquire is not granted (R-LEASE-13)")
+    while bench.now_us - began_us < 700_000:  # the last one arrives before the lease of the first ends
         bench.rest(150_000)
         sender.send_request("acquire")
     bench.rest(500_000)
-    Sender(sender.robot).expect(GOOD, what="1.3 s after the first, 0.5 s after the last acquire another")
+    Sender(sender.robot).expect(GOOD, what="1.2 s after the first, 0.5 s after the last acquire another")
 
 
 @SUITE.must("R-LEASE-15", "8.2 Requests and replies", ready)

@@ -8,7 +8,7 @@ from typing import Final
 
 from sightline.conformance.case import Bench, Suite
 from sightline.conformance.measured import mean_moving, mean_travel
-from sightline.conformance.robot.fixture import CRAWL, DRIVEN, SETTLES_US, Robot, Sender, armed
+from sightline.conformance.robot.fixture import CRAWL, DRIVEN, FAST_LINK_US, SETTLES_US, Robot, Sender, armed
 from sightline.protocol.channels import STATUS
 from sightline.protocol.errors import CLAMPED
 from sightline.protocol.messages import FrameHeader, Planar, State, Status
@@ -24,6 +24,9 @@ _OFF_RAD_S: Final = 0.15
 """Error limit of measured motion in addition to a share: a wheel slips, an encoder has steps."""
 _OVERSHOOT: Final = 1.15
 _MEASURED_US: Final = 600_000
+_AGED_US: Final = 250_000
+_FRESH_US: Final = 150_000
+"""Age of a frame at which a robot begins to slow down (5.3)."""
 
 
 def _settled(robot: Robot) -> Planar:
@@ -291,11 +294,13 @@ def ageing_frame_slows_a_turn(bench: Bench, driver: Sender) -> None:
 def _expect_slower(bench: Bench, driver: Sender, axis: int, unit: str) -> None:
     limit = _limits(driver.robot.status())[axis]
     bench.need(limit < math.inf, "the robot reports no limit (R-LIM-02)")
+    aged_by_link_us = driver.robot.link_us()
+    bench.need(aged_by_link_us + FAST_LINK_US < _FRESH_US, "over this link, it slows down by the age of every frame")
     driver.drive("|".join(f"{limit if one == axis else 0.0:.4f}" for one in (0, 1)).encode())
     bench.rest(1_000_000)
     full = driver.robot.next_status().applied[axis]
     slowed_us = driver.robot.clock_us()
-    driver.delay_us = driver.compute_us = 250_000
+    driver.delay_us = driver.compute_us = _AGED_US - aged_by_link_us
     bench.rest(1_500_000)
     measured = mean_moving(driver.robot.readings(slowed_us - _MEASURED_US, slowed_us))
     mark, accepted, settled_us = bench.mark(), driver.robot.status(), driver.robot.clock_us()

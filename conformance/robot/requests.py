@@ -298,6 +298,7 @@ def counters_never_fall(bench: Bench, operator: Sender) -> None:
     driver = armed(bench)
     driver.drive(None)
     bench.need(operator.robot.stops(2_000_000), "it does not stop (R-SIL-01)")
+    driver.robot.next_status()
     driver.need_unknown()
     before = operator.robot.next_status()
     operator.send_request("stop")

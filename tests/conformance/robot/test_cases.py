@@ -18,7 +18,10 @@ from sightline.robot_side.network.stream import StreamConfig
 from tests.conformance.clauses import clauses
 from tests.conformance.robot import reference
 from tests.conformance.robot.broken import arming as broken_arming
+from tests.conformance.robot.broken import credit as broken_credit
+from tests.conformance.robot.broken import lease as broken_lease
 from tests.conformance.robot.broken import motion as broken_motion
+from tests.conformance.robot.broken import order as broken_order
 from tests.conformance.robot.broken.breaking import bend_out, fields_of, wrap
 from tests.conformance.robot.reference import KEYED, virtual_robot
 
@@ -218,12 +221,58 @@ def test_robot_with_a_fast_camera_widens_its_window_on_a_long_link(monkeypatch, 
     assert result.outcome is Outcome.PASSED, result.reason
 
 
-@pytest.mark.parametrize("delay_us", [80_000, 150_000])
-@pytest.mark.parametrize("name", ["R-FLOW-08", "R-FLOW-14", "R-RECO-04"])
-def test_our_robot_passes_over_a_slow_link(monkeypatch, name, delay_us):
+def over_link(monkeypatch, delay_us):
     monkeypatch.setattr(reference, "MemoryNetwork", lambda: MemoryNetwork(delay_us=delay_us))
+
+
+@pytest.mark.parametrize("delay_us", [80_000, 150_000])
+@pytest.mark.parametrize("name", ["R-CAUS-10", "R-CAUS-15", "R-FLOW-04", "R-FLOW-07", "R-FLOW-08", "R-FLOW-14",
+                                  "R-FRAM-13", "R-HOST-06", "R-HOST-10", "R-LEASE-06", "R-LEASE-14", "R-LEASE-31",
+                                  "R-LIM-08", "R-RECO-04", "R-SEQ-12", "R-STAT-01", "R-STAT-03", "R-STAT-11"])
+def test_our_robot_passes_over_a_slow_link(monkeypatch, name, delay_us):
+    over_link(monkeypatch, delay_us)
     result = result_of(CASES_BY_ID[name])
     assert result.outcome is Outcome.PASSED, result.reason
+
+
+@pytest.mark.parametrize(("delay_us", "outcome"), [(90_000, Outcome.PASSED), (200_000, Outcome.SKIPPED)])
+@pytest.mark.parametrize("name", ["R-SIL-05", "R-SIL-14"])
+def test_case_about_age_is_not_applicable_where_the_link_alone_slows_the_robot(monkeypatch, name, delay_us, outcome):
+    over_link(monkeypatch, delay_us)
+    result = result_of(CASES_BY_ID[name])
+    assert result.outcome is outcome, result.reason
+
+
+@pytest.mark.parametrize("cases", [VIRTUAL[::8], pytest.param(VIRTUAL, marks=pytest.mark.slow)], ids=["some", "all"])
+@pytest.mark.parametrize("delay_us", [120_000, 200_000, 250_000, 300_000])
+def test_our_robot_conforms_over_a_slow_link(monkeypatch, delay_us, cases):
+    over_link(monkeypatch, delay_us)
+    results = {case.id: result_of(case) for case in cases}
+    assert {name: one.reason for name, one in results.items() if one.outcome is Outcome.FAILED} == {}
+    assert {one.case.id: one.reason for one in untested(list(results.values()))} == {}
+
+
+@pytest.mark.parametrize("delay_us", [80_000, 150_000])
+@pytest.mark.parametrize(("name", "break_it"), [
+    ("R-CAUS-15", broken_order.one_twist_for_a_frame), ("R-LEASE-14", broken_lease.acquire_renews),
+    ("R-HOST-10", broken_credit.forgets_who_drives_when_many_come)])
+def test_broken_robot_fails_over_a_slow_link(monkeypatch, name, break_it, delay_us):
+    over_link(monkeypatch, delay_us)
+    assert result_of(CASES_BY_ID[name], break_it).outcome is Outcome.FAILED
+
+
+@pytest.mark.parametrize(("reply_us", "link_us"), [(20_000, 0), (200_000, 150_000), (900_000, 300_000), (None, 0)])
+def test_robot_that_replies_late_gets_a_bounded_time(monkeypatch, reply_us, link_us):
+    def replies_late(robot):
+        def around(inner, message):
+            if reply_us is not None:
+                bench.after(reply_us, lambda: inner(message))
+
+        wrap(robot, "on_request", around)
+
+    bench, _robot = virtual_robot(replies_late)
+    prepare(bench)
+    assert link_us <= bench.link_us <= link_us + 30_000
 
 
 @pytest.mark.parametrize(("joins_after_us", "outcome"), [(200_000, Outcome.PASSED), (900_000, Outcome.SKIPPED)])
