@@ -13,7 +13,6 @@ from sightline.conformance.robot.fixture import (
     Sender,
     arm,
     armed,
-    is_arm_granted,
     moving,
     operator,
     ready,
@@ -446,5 +445,5 @@ def arms_after_reset(bench: Bench, first: Sender) -> None:
     driver.drive()
     _send_more(driver, 8)
     driver.robot.next_status()
-    bench.expect(is_arm_granted(driver), "arm is not granted after reset")
+    bench.expect(driver.granted("arm"), "arm is not granted after reset")
     arm(driver)
