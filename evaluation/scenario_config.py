@@ -108,11 +108,9 @@ def _check_sight(config: RobotConfig, model: RobotModel) -> None:
         raise ConfigError(f"robot {model.name}: [settings] {error}") from None
 
 
-def vision_config(
-    scenario: Scenario, model: RobotModel, seed: int = 0, mission: str | None = None, base: VisionConfig | None = None
-) -> VisionConfig:
-    """Return the vision configuration over `base`, checked. Raises ConfigError that names scenario and key."""
-    table = laid_over((base or VisionConfig()).model_dump(), vision_table(scenario, model, seed, mission))
+def vision_config(scenario: Scenario, model: RobotModel, seed: int = 0, mission: str | None = None) -> VisionConfig:
+    """Return the vision configuration, checked. Raises ConfigError that names scenario and key."""
+    table = vision_table(scenario, model, seed, mission)
     return _checked(VisionConfig, table, f"scenario {scenario.name}: [vision]")
 
 

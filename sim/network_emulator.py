@@ -163,8 +163,8 @@ def _flipped(packet: bytes, random: Random) -> bytes:
 class EmulatedLink:
     """Two legs on one medium, or on one each."""
 
-    def __init__(self, seed: int = 1) -> None:
-        self.ab, self.ba = EmulatedLeg(f"{seed} ab"), EmulatedLeg(f"{seed} ba")
+    def __init__(self) -> None:
+        self.ab, self.ba = EmulatedLeg("1 ab"), EmulatedLeg("1 ba")
 
     def shape(self, shapes: LinkShapes) -> None:
         """Apply `shapes` to packets from now on."""

@@ -25,14 +25,11 @@ RESERVE_US: Final = 20_000
 class Fallback:
     """A `Detector` with a first and a second detector."""
 
-    def __init__(
-        self, first: Detector, second: Detector, good_answers: int = GOOD_ANSWERS, max_pixels: int = MAX_PIXELS
-    ) -> None:
+    def __init__(self, first: Detector, second: Detector, max_pixels: int = MAX_PIXELS) -> None:
         """Run a `first` without its own deadline on a separate thread, with images of up to `max_pixels`."""
         self._first = first if isinstance(first, DeadlineDetector) else DeadlineDetector(first, max_pixels)
         self._second = second
         self._news = Notices()
-        self._good_answers = good_answers
         self._good: OrderedDict[str, int] = OrderedDict()
         """Robots that the second detector steers -> good answers of the first in a row."""
         self._beside: list[tuple[list[str], Pending]] = []
@@ -104,7 +101,7 @@ class Fallback:
             good[robot] = good[robot] and result is not None
         for robot in good.keys() & self._good.keys():
             self._good[robot] = self._good[robot] + 1 if good[robot] else 0
-            if self._good[robot] >= self._good_answers:
+            if self._good[robot] >= GOOD_ANSWERS:
                 del self._good[robot]
-                self._news.add(f"the first detector gave {self._good_answers} good answers for {robot}: it drives "
+                self._news.add(f"the first detector gave {GOOD_ANSWERS} good answers for {robot}: it drives "
                                "again")
