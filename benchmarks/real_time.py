@@ -2,14 +2,13 @@
 
 import json
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from statistics import median
 from typing import Any, Final
 
-from sightline.evaluation.processes import ProcessError
+from sightline.evaluation.processes import SIGHTLINE, ProcessError
 
 _SCORED: Final = (0, 5)
 
@@ -57,7 +56,7 @@ def _demo(scenario: str, seed: int, seconds: float | None) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="sightline-demo-") as folder:
         lasting = [] if seconds is None else ["--seconds", f"{seconds:g}"]
         arguments = ["demo", "--scenario", scenario, "--seed", str(seed), *lasting, "--out", folder, "--json"]
-        command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", *arguments]
+        command = [*SIGHTLINE, *arguments]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode not in _SCORED:
         last = done.stderr.strip().rpartition("\n")[2].removeprefix("error: ")

@@ -42,6 +42,8 @@ def terminated_like_interrupted() -> Iterator[None]:
 
 
 COMMAND_LINE: Final = "sightline.operator_side.cli.app"
+SIGHTLINE: Final = (sys.executable, "-P", "-m", COMMAND_LINE)
+"""The command `sightline` of this environment. No file in the current folder can replace a package of it."""
 READY_S: Final = 30.0
 """Time for one process to print that it is ready. A first start reads hundreds of megabytes from disk."""
 _END_S: Final = 4.0

@@ -19,13 +19,13 @@ from pathlib import Path
 from typing import Any
 
 from sightline.conformance.runner import Outcome, printable
+from sightline.evaluation.processes import SIGHTLINE
 from sightline.operator_side.setup import keys
 from tests.fixtures.javascript import EXAMPLES, ROOT, JsRobot, JsVision, node
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint, free_port
 from tests.fixtures.robot_process import RobotProcess
 
-SIGHTLINE = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
 KEPT = ROOT / "runs" / "conformance"
 PAGE = ROOT / "docs" / "reference" / "results" / "conformance.md"
 ADAPTER = EXAMPLES.parent / "codec_adapter.py"

@@ -21,6 +21,7 @@ from typing import Any, Final
 from docs.make.performance import processor
 from sightline.evaluation.faults.cases import CASES
 from sightline.evaluation.faults.report import figure_text, value_text
+from sightline.evaluation.processes import SIGHTLINE
 from sightline.operator_side.cli.options import CHECK_FAILED
 
 DOCS: Final = Path(__file__).parents[1]
@@ -62,8 +63,7 @@ def describe_machine() -> list[str]:
 def measured(arguments: Sequence[str]) -> Record:
     """Run the command. Raises RuntimeError with its error line if it printed no result."""
     machine, command = describe_machine(), ["faults", *arguments]
-    program = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
-    done = subprocess.run([*program, *command, "--json"], stdout=subprocess.PIPE, text=True, check=False)
+    done = subprocess.run([*SIGHTLINE, *command, "--json"], stdout=subprocess.PIPE, text=True, check=False)
     if done.returncode not in (0, CHECK_FAILED):
         raise RuntimeError(f"sightline {' '.join(command)} ended with {done.returncode}")
     result = json.loads(done.stdout.splitlines()[-1])

@@ -19,6 +19,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
+from sightline.evaluation.processes import SIGHTLINE
 from sightline.operator_side.cli.options import CHECK_FAILED
 from sightline.protocol.errors import ConfigError
 
@@ -299,8 +300,7 @@ def _measured(section: Section, pictures: Path) -> dict[str, Any]:
 
 def _run(arguments: Sequence[str]) -> dict[str, Any]:
     """Return the command's JSON object. Raises RuntimeError with its error line if it printed none."""
-    command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", *arguments, "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run([*SIGHTLINE, *arguments, "--json"], capture_output=True, text=True, check=False)
     if done.returncode not in (0, CHECK_FAILED):
         raise RuntimeError(f"{' '.join(arguments)}: {done.stderr.strip()}")
     return dict(json.loads(done.stdout.strip().splitlines()[-1]))

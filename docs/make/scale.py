@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Final
 
 from docs.make.performance import processor
+from sightline.evaluation.processes import SIGHTLINE
 
 DOCS: Final = Path(__file__).parents[1]
 PAGE: Final = Path("how-to", "scale.md")
@@ -246,7 +247,7 @@ def measure_router(docs: Path = DOCS) -> float:
     from sightline.protocol.transports.open import open_link
 
     endpoint, payload, arrived = "tcp/127.0.0.1:7497", os.urandom(47_000), threading.Event()
-    program = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "router", "--listen", endpoint]
+    program = [*SIGHTLINE, "router", "--listen", endpoint]
     with subprocess.Popen(program, stdout=subprocess.DEVNULL) as router:
         try:
             with (open_link("r1", connect=[endpoint], role="robot", timeout_s=10.0) as robot,

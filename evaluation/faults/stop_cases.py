@@ -3,7 +3,6 @@
 import resource
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -34,7 +33,7 @@ from sightline.evaluation.faults.load_clients import (
 )
 from sightline.evaluation.faults.peer import LEGACY_LIBRARIES
 from sightline.evaluation.faults.runner import FaultCase, Injected
-from sightline.evaluation.processes import children_of
+from sightline.evaluation.processes import SIGHTLINE, children_of
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import LinkError
 from sightline.robot_side.safety.limits import SafetyConfig
@@ -141,7 +140,7 @@ def _typed(rig: RobotFixture) -> Injected:
     """Run `sightline stop`, and count from the start of its process, as from the Enter key."""
     before, at_us = resource.getrusage(resource.RUSAGE_CHILDREN), monotonic_us()
     code = subprocess.run(
-        [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "stop", ROBOT, "--connect", rig.endpoint],
+        [*SIGHTLINE, "stop", ROBOT, "--connect", rig.endpoint],
         check=False, capture_output=True, timeout=STOP_ENDS_S,
     ).returncode
     after = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -14,11 +14,11 @@ from tempfile import TemporaryDirectory
 import av
 import pytest
 
-from sightline.evaluation.processes import ProcessError, Processes, children_of
+from sightline.evaluation.processes import SIGHTLINE, ProcessError, Processes, children_of
 from sightline.protocol.errors import SightlineError
 from tests.fixtures.links import until
 
-COMMAND = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "demo"]
+COMMAND = [*SIGHTLINE, "demo"]
 
 
 def running() -> dict[int, str]:

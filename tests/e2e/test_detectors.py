@@ -4,14 +4,13 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from sightline.evaluation.processes import Processes
+from sightline.evaluation.processes import SIGHTLINE, Processes
 from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.color.hsv import HsvDetector
@@ -33,7 +32,7 @@ class VisionProcess:
         self._arguments = arguments
 
     def __enter__(self) -> "VisionProcess":
-        command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "vision", *self._arguments]
+        command = [*SIGHTLINE, "vision", *self._arguments]
         self.process = subprocess.Popen(command, stdout=self._log, stderr=subprocess.STDOUT)
         return self
 
@@ -107,18 +106,7 @@ def _driving(tmp_path, detector, *options, beside=None):
     (tmp_path / "pictures" / "0.jpg").write_bytes(FAR_BALL)
     log = tmp_path / "vision.log"
     command = [
-        sys.executable,
-        "-u",
-        "-P",
-        "-m",
-        "sightline.operator_side.cli.app",
-        "vision",
-        "--connect",
-        robot.endpoint,
-        "--detector",
-        detector,
-        "--set",
-        "boxes.height_m=0.2",
+        *SIGHTLINE, "vision", "--connect", robot.endpoint, "--detector", detector, "--set", "boxes.height_m=0.2",
         *options,
     ]
     with robot, log.open("wb") as out:

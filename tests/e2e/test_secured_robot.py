@@ -1,13 +1,13 @@
 """A real robot over mutual TLS: its vision drives it, an operator commands it, unauthorized clients move nothing."""
 
 import secrets
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
 from sightline.benchmarks.loop.pictures import write_pictures
+from sightline.evaluation.processes import SIGHTLINE
 from sightline.operator_side.setup import keys
 from sightline.protocol.channels import FRAME, STATUS, TWIST
 from sightline.protocol.codec import decode, encode
@@ -78,10 +78,10 @@ def shared_robot(tmp_path):
     pictures.mkdir()
     write_pictures(pictures, 160, 120)
     camera = {"kind": "folder", "options": {"path": str(pictures)}}
-    program, where = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"], ["--secure", folder]
-    with service([*program, "router", "--listen", endpoint, *where], " on ", tmp_path, START_S), \
+    where = ["--secure", folder]
+    with service([*SIGHTLINE, "router", "--listen", endpoint, *where], " on ", tmp_path, START_S), \
          RobotProcess(tmp_path, listen=[], connect=[endpoint], secure=folder, camera=camera) as robot, \
-         service([*program, "vision", "--share", "--connect", endpoint, *where], "drives it", tmp_path, START_S):
+         service([*SIGHTLINE, "vision", "--share", "--connect", endpoint, *where], "drives it", tmp_path, START_S):
         yield robot, endpoint, folder
 
 

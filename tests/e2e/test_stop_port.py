@@ -2,18 +2,15 @@
 
 import json
 import subprocess
-import sys
 from contextlib import ExitStack, contextmanager
 
 import pytest
 
+from sightline.evaluation.processes import SIGHTLINE
 from sightline.operator_side.setup import keys
 from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess, Vision
-
-COMMAND = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
-
 
 CASES = [part for number in range(22, 27) for part in ("--only", f"R-STOP-{number}")]
 
@@ -31,7 +28,8 @@ def running_robot(folder, routed, secured):
     with ExitStack() as ending:
         if routed:
             router = ending.enter_context(
-                subprocess.Popen([*COMMAND, "router", "--listen", endpoint, *secure], stdout=subprocess.PIPE, text=True)
+                subprocess.Popen([*SIGHTLINE, "router", "--listen", endpoint, *secure],
+                                 stdout=subprocess.PIPE, text=True)
             )
             ending.callback(router.terminate)
             assert " info router: on " in router.stdout.readline()
@@ -48,7 +46,7 @@ def test_stop_ends_with_zero_wheels_and_a_latch_on_disk(tmp_path, routed, secure
             Vision(endpoint, secure="".join(secure[1:])):
         assert until(lambda: robot.speed() > 0, START_S)
         done = subprocess.run(
-            [*COMMAND, "stop", "r1", "--connect", endpoint, *secure], capture_output=True, text=True, timeout=30,
+            [*SIGHTLINE, "stop", "r1", "--connect", endpoint, *secure], capture_output=True, text=True, timeout=30,
             check=False,
         )
         assert done.returncode == 0, done.stderr
@@ -61,8 +59,8 @@ def test_stop_ends_with_zero_wheels_and_a_latch_on_disk(tmp_path, routed, secure
 @pytest.mark.parametrize(("routed", "secured"), [(False, False), (True, True)])
 def test_robot_passes_the_cases_about_its_stop_port(tmp_path, routed, secured):
     with running_robot(tmp_path, routed, secured) as (_robot, endpoint, secure):
-        done = subprocess.run([*COMMAND, "conform", "robot", endpoint, *secure, *CASES, "--json"], capture_output=True,
-                              text=True, timeout=60, check=False)
+        done = subprocess.run([*SIGHTLINE, "conform", "robot", endpoint, *secure, *CASES, "--json"],
+                              capture_output=True, text=True, timeout=60, check=False)
     outcomes = {one["name"]: one["value"] for one in json.loads(done.stdout)["checks"]}
     keyed = "passed" if secured else "not applicable"
     assert outcomes == {f"R-STOP-{number}": "passed" if number < 26 else keyed for number in range(22, 27)}, done.stderr

@@ -2,17 +2,17 @@
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
 from sightline.evaluation.faults.evidence import measure_stop, read_motors
+from sightline.evaluation.processes import SIGHTLINE
 
 pytestmark = pytest.mark.slow
 
-COMMAND = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "demo"]
+COMMAND = [*SIGHTLINE, "demo"]
 
 
 def demo(*options: str) -> subprocess.CompletedProcess[str]:

@@ -9,13 +9,13 @@ import re
 import shlex
 import shutil
 import subprocess
-import sys
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
+from sightline.evaluation.processes import SIGHTLINE
 from sightline.vision_side.detect.onnx.detector import NANODET
 from tests.fixtures.commands import service
 from tests.fixtures.links import until
@@ -69,7 +69,7 @@ class Terminals:
         return output
 
     def _command(self, words: list[str]) -> list[str]:
-        return [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", *words]
+        return [*SIGHTLINE, *words]
 
     def _once(self, words: list[str]) -> str:
         done = subprocess.run(self._command(words), cwd=ROOT, env=self._env, capture_output=True, text=True,

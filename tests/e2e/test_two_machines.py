@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from sightline.evaluation.faults.fixture import BenchWire
+from sightline.evaluation.processes import SIGHTLINE
 from sightline.sim.network_emulator import LinkShape, LinkShapes
 from sightline.sim.tun_emulator import ADDRESS_A, ADDRESS_B, why_impossible
 from tests.fixtures.commands import service
@@ -68,17 +69,7 @@ class Machines:
         return self._once(self._command(machine, arguments))
 
     def _command(self, machine, arguments):
-        return [
-            "ip",
-            "netns",
-            "exec",
-            self._names[machine],
-            sys.executable,
-            "-P",
-            "-m",
-            "sightline.operator_side.cli.app",
-            *arguments.split(),
-        ]
+        return ["ip", "netns", "exec", self._names[machine], *SIGHTLINE, *arguments.split()]
 
     def _once(self, command):
         done = subprocess.run(command, cwd=self._folder, env=self._env, capture_output=True, text=True, timeout=40,
@@ -149,6 +140,6 @@ def test_without_listen_no_other_machine_reaches_the_robot(wire, tmp_path):
 @pytest.mark.slow
 def test_every_command_of_the_page_is_known():
     names = set(re.findall(r"sightline ([a-z]\w*)", PAGE))
-    command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "-h"]
+    command = [*SIGHTLINE, "-h"]
     known = subprocess.run(command, capture_output=True, text=True, check=True)
     assert names <= set(re.findall(r"^  (\w+) ", known.stdout, re.MULTILINE)), names

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pytest
 
+from sightline.evaluation.processes import SIGHTLINE
 from sightline.protocol import log
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import (
@@ -113,17 +114,7 @@ def test_an_unknown_form_is_rejected(monkeypatch):
 
 
 def test_a_service_prints_its_errors_as_json_too():
-    command = [
-        sys.executable,
-        "-P",
-        "-m",
-        "sightline.operator_side.cli.app",
-        "vision",
-        "--connect",
-        "nowhere",
-        "--log",
-        "json",
-    ]
+    command = [*SIGHTLINE, "vision", "--connect", "nowhere", "--log", "json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
     assert done.returncode == 2 and done.stdout == ""
     said = json.loads(done.stderr)

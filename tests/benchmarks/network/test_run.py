@@ -19,12 +19,13 @@ from sightline.benchmarks.network.figures import (
 from sightline.benchmarks.network.run import SCENES, write_film
 from sightline.benchmarks.network.stage import NetworkSetting
 from sightline.evaluation.checks import Check, at_most
+from sightline.evaluation.processes import SIGHTLINE
 from sightline.protocol.errors import ConfigError
 from sightline.sim.network_emulator import EmulatedLink, LinkShape, LinkShapes
 from sightline.sim.tun_emulator import why_impossible
 
 SECOND_US = 1_000_000
-COMMAND = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "bench", "network"]
+COMMAND = [*SIGHTLINE, "bench", "network"]
 
 
 def status(at_s, state="ACTIVE", accepted=0, stale=0, age_ms=50, sent=0):

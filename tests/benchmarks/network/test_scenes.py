@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-import sys
 
 import pytest
 
@@ -18,6 +17,7 @@ from sightline.benchmarks.network.scenes import (
     stop_checks_of,
 )
 from sightline.evaluation.faults.evidence import MotorRow
+from sightline.evaluation.processes import SIGHTLINE
 from sightline.sim.tun_emulator import why_impossible
 
 TICK_US = 20_000
@@ -172,19 +172,7 @@ def test_a_robot_that_is_missing_is_noticed():
 @pytest.mark.slow
 @pytest.mark.skipif(bool(why_impossible()), reason=f"{why_impossible()}; run the tests as root with /dev/net/tun")
 def test_standby_row_runs_with_real_processes():
-    command = [
-        sys.executable,
-        "-P",
-        "-m",
-        "sightline.operator_side.cli.app",
-        "bench",
-        "network",
-        "--only",
-        "standby",
-        "--seconds",
-        "4",
-        "--json",
-    ]
+    command = [*SIGHTLINE, "bench", "network", "--only", "standby", "--seconds", "4", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     said = json.loads(done.stdout)
     taken = next(check for check in said["checks"] if "drives again" in check["name"])

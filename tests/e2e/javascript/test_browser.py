@@ -3,18 +3,16 @@
 import os
 import re
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
+from sightline.evaluation.processes import SIGHTLINE
 from tests.fixtures.javascript import Browser, JsProcess, JsRobot, chromium, node
 from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_port
-
-SIGHTLINE = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
 
 # Brightness of the canvas at a grid of points: an image has several levels, an empty canvas one.
 LEVELS = """(() => {

@@ -2,17 +2,17 @@
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from sightline import conformance
+from sightline.evaluation.processes import SIGHTLINE
 from tests.fixtures.javascript import EXAMPLES, JsRobot, JsVision, node
 from tests.fixtures.ports import free_port
 
-CONFORM = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "conform"]
+CONFORM = [*SIGHTLINE, "conform"]
 NOT_APPLICABLE = (
     "over WebSocket nothing is sent under a key",
     "no token was named",

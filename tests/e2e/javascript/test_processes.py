@@ -3,7 +3,6 @@
 import json
 import shutil
 import subprocess
-import sys
 import time
 from typing import Any
 
@@ -12,12 +11,11 @@ import numpy as np
 import pytest
 from websockets.sync.client import connect
 
+from sightline.evaluation.processes import SIGHTLINE
 from tests.fixtures.javascript import ROOT, JsProcess, JsRobot, JsVision, hello, json_payload
 from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_port
 from tests.fixtures.robot_process import RobotProcess, driving
-
-SIGHTLINE = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
 
 
 def sightline(*arguments: str, ok: bool = True) -> str:

@@ -2,13 +2,13 @@
 
 import socket
 import subprocess
-import sys
 import urllib.error
 import urllib.request
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families as parsed
 
+from sightline.evaluation.processes import SIGHTLINE
 from sightline.operator_side.cli import app as cli
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_port
@@ -33,16 +33,7 @@ def _ready(port):
 def test_metrics_show_a_robot_and_its_end(tmp_path):
     port = free_port()
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
-        command = [
-            sys.executable,
-            "-P",
-            "-m",
-            "sightline.operator_side.cli.app",
-            "metrics",
-            "r1",
-            "--connect",
-            robot.endpoint,
-        ]
+        command = [*SIGHTLINE, "metrics", "r1", "--connect", robot.endpoint]
         exporter = subprocess.Popen([*command, "--port", str(port)], stdout=subprocess.PIPE, text=True)
         try:
             assert exporter.stdout.readline() == f"metrics of r1: http://127.0.0.1:{port}/metrics\n"
@@ -72,16 +63,7 @@ def test_metrics_show_a_robot_and_its_end(tmp_path):
 @pytest.mark.slow
 def test_busy_port_is_reported_with_its_owner(tmp_path):
     with RobotProcess(tmp_path) as robot, socket.create_server(("127.0.0.1", free_port())) as taken:
-        command = [
-            sys.executable,
-            "-P",
-            "-m",
-            "sightline.operator_side.cli.app",
-            "metrics",
-            "--connect",
-            robot.endpoint,
-            "--port",
-        ]
+        command = [*SIGHTLINE, "metrics", "--connect", robot.endpoint, "--port"]
         robot.wait_until_on()
         port = str(taken.getsockname()[1])
         done = subprocess.run([*command, port], capture_output=True, text=True, timeout=60, check=False)
@@ -94,7 +76,7 @@ def test_vision_service_is_measured_and_ready_while_its_link_is_open(tmp_path):
     port = free_port()
     with RobotProcess(tmp_path) as robot:
         robot.wait_until_on()
-        command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "vision", "--connect", robot.endpoint]
+        command = [*SIGHTLINE, "vision", "--connect", robot.endpoint]
         vision = subprocess.Popen([*command, "--metrics", str(port)], stdout=subprocess.PIPE, text=True)
         try:
             assert until(lambda: _ready_if_up(port) == 200, 40)

@@ -13,6 +13,7 @@ from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.network import gated_robots
 from sightline.benchmarks.network.gated_robots import GatedRobot
 from sightline.benchmarks.network.robots import Settings, play
+from sightline.evaluation.processes import SIGHTLINE
 from sightline.protocol.channels import FRAME
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.transports.zenoh.link import ZenohFleet, open_fleet, open_zenoh
@@ -165,7 +166,7 @@ def test_200_robots_at_one_router_are_all_served_and_none_is_forgotten(tmp_path)
     write_pictures(tmp_path, 160, 120)
     endpoint, notes, (soft, hard) = free_endpoint(), tmp_path / "notes", resource.getrlimit(resource.RLIMIT_NOFILE)
     settings = Settings(endpoint=endpoint, robots=200, fps=5, pictures=tmp_path, notes=notes, seed=1)
-    router = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "router", "--listen", endpoint]
+    router = [*SIGHTLINE, "router", "--listen", endpoint]
     robots = [sys.executable, "-P", "-m", gated_robots.__name__, settings.model_dump_json()]
     with ExitStack() as at_end:
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))

@@ -2,13 +2,12 @@
 
 import signal
 import subprocess
-import sys
 import time
 
 import pytest
 
 from sightline.benchmarks.detector import DEADLINE_MS, LONGEST_GAP_MS, StreamPlan, measure_streams
-from sightline.evaluation.processes import Processes
+from sightline.evaluation.processes import SIGHTLINE, Processes
 from sightline.operator_side.cli import app as cli
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.vision_side.detect.remote.zenoh_detector import ZenohDetector
@@ -55,18 +54,7 @@ def test_detector_process_is_found_answers_and_ends_on_request(tmp_path, capsys)
 
 def test_detector_service_ends_within_a_second_of_a_signal(tmp_path):
     endpoint = free_endpoint()
-    command = [
-        sys.executable,
-        "-u",
-        "-P",
-        "-m",
-        "sightline.operator_side.cli.app",
-        "detector",
-        "--serve",
-        "hsv",
-        "--listen",
-        endpoint,
-    ]
+    command = [*SIGHTLINE, "detector", "--serve", "hsv", "--listen", endpoint]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert "for robots" in process.stdout.readline()
