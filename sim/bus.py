@@ -179,16 +179,26 @@ def await_simulation(socket_dir: str, seconds: float = _STARTS_WITHIN_S) -> None
         time.sleep(_RETRY_S)
 
 
-class SimCamera:
+class _BusClient:
+    """A user of one socket of the simulation."""
+
+    def __init__(self, socket_dir: str, name: str) -> None:
+        self._connection = BusConnection(socket_dir, name)
+
+    def close(self) -> None:
+        """Close the connection. Idempotent; motors keep their last speeds."""
+        self._connection.close()
+
+
+class SimCamera(_BusClient):
     """The simulated camera. The simulation draws an image only on a call of `read`."""
 
-    class Config(SimSocketConfig):
-        """Address of the simulation."""
+    Config = SimSocketConfig
 
     live = True
 
     def __init__(self, config: SimSocketConfig) -> None:
-        self._connection = BusConnection(config.socket_dir, CAMERA)
+        super().__init__(config.socket_dir, CAMERA)
         self._request = PICTURE_REQUEST.pack(100, 100)
         self.model: CameraModel
         self._greet()
@@ -215,21 +225,16 @@ class SimCamera:
         self._request = PICTURE_REQUEST.pack(quality_percent, scale_percent)
         return True
 
-    def close(self) -> None:
-        """Close the connection. Idempotent."""
-        self._connection.close()
 
-
-class SimDrive:
+class SimDrive(_BusClient):
     """The simulated wheels. Their speeds latch and outlive this process."""
 
     zero = staticmethod(zero)
 
-    class Config(SimSocketConfig):
-        """Address of the simulation."""
+    Config = SimSocketConfig
 
     def __init__(self, config: SimSocketConfig) -> None:
-        self._connection = BusConnection(config.socket_dir, MOTION)
+        super().__init__(config.socket_dir, MOTION)
         self._connection.open()
         check_free(config.socket_dir)
         self._angles: WheelAngles | None = None
@@ -254,19 +259,14 @@ class SimDrive:
             self._angles = WheelAngles(*MOTION_ANGLES.unpack(message))
         return self._angles
 
-    def close(self) -> None:
-        """Close the connection. Idempotent; the motors keep their last speeds."""
-        self._connection.close()
 
-
-class SimRange:
+class SimRange(_BusClient):
     """The simulated lidar."""
 
-    class Config(SimSocketConfig):
-        """Address of the simulation."""
+    Config = SimSocketConfig
 
     def __init__(self, config: SimSocketConfig) -> None:
-        self._connection = BusConnection(config.socket_dir, RANGE)
+        super().__init__(config.socket_dir, RANGE)
         self._connection.open()
 
     def read(self) -> Ranges | None:
@@ -278,12 +278,8 @@ class SimRange:
         ranges_m = array.array("f", message[RANGE_HEAD.size :])
         return Ranges(t_us, first_rad, each_rad, least_m, most_m, ranges_m)
 
-    def close(self) -> None:
-        """Close the connection. Idempotent."""
-        self._connection.close()
 
-
-class SimBattery:
+class SimBattery(_BusClient):
     """A battery that the turning wheels drain, from full to empty over a distance."""
 
     class Config(SimSocketConfig):
@@ -297,7 +293,7 @@ class SimBattery:
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._connection = BusConnection(config.socket_dir, MOTION)
+        super().__init__(config.socket_dir, MOTION)
         self._connection.open()
         self._angles_rad = (0.0, 0.0)  # of a simulation that has just started: its battery outlives this process
         self._turned_rad = 0.0
@@ -314,10 +310,6 @@ class SimBattery:
         share = min(1.0, self._turned_rad * config.wheel_radius_m / config.range_m)
         return config.full_v - share * (config.full_v - config.empty_v)
 
-    def close(self) -> None:
-        """Close the connection. Idempotent."""
-        self._connection.close()
-
 
 class SimulationInfo(Config):
     """The description of a simulation, sufficient to load its scenario and robot again."""
@@ -328,11 +320,11 @@ class SimulationInfo(Config):
     pid: int
 
 
-class TruthReader:
+class TruthReader(_BusClient):
     """Reads the true state, for displays and scores."""
 
     def __init__(self, socket_dir: str) -> None:
-        self._connection = BusConnection(socket_dir, TRUTH)
+        super().__init__(socket_dir, TRUTH)
         self.simulated = SimulationInfo.model_validate_json(self._connection.hello())
 
     def read(self, timeout_s: float) -> Truth | None:
@@ -341,10 +333,6 @@ class TruthReader:
             if b'"t_us"' in message:
                 return Truth.from_json(message)
         return None
-
-    def close(self) -> None:
-        """Close the connection. Idempotent."""
-        self._connection.close()
 
 
 # Labels of simulated images, written to and read from the bus; `world/sensors.py` makes them. Shell (sockets).
@@ -375,11 +363,11 @@ def to_json(labels: Iterable[Label], t_us: int, width_px: int) -> bytes:
     return json.dumps({LABELLED_US: t_us, "width_px": width_px, "boxes": [one._asdict() for one in labels]}).encode()
 
 
-class LabelReader:
+class LabelReader(_BusClient):
     """The labels of the newest images, by their capture times."""
 
     def __init__(self, socket_dir: str) -> None:
-        self._connection = BusConnection(socket_dir, TRUTH)
+        super().__init__(socket_dir, TRUTH)
         self._connection.hello()
         self._kept: OrderedDict[int, dict[str, Any]] = OrderedDict()
 
@@ -404,10 +392,6 @@ class LabelReader:
         self._kept[table[LABELLED_US]] = table
         if len(self._kept) > KEPT:
             self._kept.popitem(last=False)
-
-    def close(self) -> None:
-        """Close the connection. Idempotent."""
-        self._connection.close()
 
 
 def _scaled(box: dict[str, Any], factor: float) -> dict[str, Any]:
