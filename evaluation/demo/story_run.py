@@ -129,7 +129,7 @@ class TakeProcesses:
             self._ending = self._ending.pop_all()
         return self
 
-    def __exit__(self, *about: object) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ending.close()
 
     def _start(self) -> None:

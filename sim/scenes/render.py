@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Any, Self
 
 import cv2
@@ -87,8 +86,7 @@ class SceneRenderer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         pybullet.disconnect(physicsClientId=self._client)
 
     def scene(self, seed: int, column: Column) -> Scene:

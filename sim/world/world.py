@@ -2,7 +2,6 @@
 
 import math
 from random import Random
-from types import TracebackType
 from typing import Any, Self
 
 from sightline.robot_side.ports import Ranges, WheelAngles
@@ -312,9 +311,7 @@ class World:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
