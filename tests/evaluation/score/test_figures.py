@@ -165,8 +165,3 @@ def test_one_run_without_a_figure_makes_the_worst_none():
     good, bad = scored(samples()), scored(samples(visible=lambda _: False))
     assert median_and_worst([good, good, bad], "bearing_rms_deg") == (0.0, None)
     assert median_and_worst([good, good], "bearing_rms_deg") == (0.0, 0.0)
-
-
-def test_a_run_without_samples_has_no_score():
-    with pytest.raises(ValueError, match="no score"):
-        scored([])
