@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from docs.make.reference import cell
 from tests.conformance.mutants import peers
 
 PAGE = Path(__file__).parent.parent / "reference" / "results" / "conformance-mutants.md"
@@ -66,11 +67,6 @@ def name_of(mutant: Any) -> str:
 def short(names: Sequence[str]) -> str:
     """Return the ids, or the first and the number of many."""
     return ", ".join(names) if len(names) <= 8 else f"{names[0]} and {len(names) - 1} more"
-
-
-def cell(text: str) -> str:
-    """Return text in a form for a table."""
-    return " ".join(text.replace("|", "\\|").split())
 
 
 def main() -> None:
