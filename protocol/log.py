@@ -10,6 +10,7 @@ processes of a robot use the same one.
 from __future__ import annotations
 
 import errno
+import io
 import json
 import logging
 import os
@@ -128,12 +129,28 @@ def _write(line: str, stream: TextIO | None) -> None:
     if stream is None:
         return
     try:
-        encoding = getattr(stream, "encoding", None)
-        print(line.encode(encoding, "backslashreplace").decode(encoding) if encoding else line, file=stream, flush=True)
+        encoding = getattr(stream, "encoding", None) or "utf-8"
+        data = f"{line}\n".encode(encoding, "backslashreplace")
+        stream.flush()
+        number = _descriptor(stream)
+        if number is None:
+            print(data.decode(encoding), end="", file=stream, flush=True)
+            return
+        # Without the lock of the stream, for which the end of the process would wait, or abort, if nothing reads it.
+        while data:
+            data = data[os.write(number, data):]
     except OSError as error:
         _discard(stream, has_reader=error.errno not in (errno.EPIPE, errno.EIO))
     except Exception:  # an error with one line must not stop the next lines
         return
+
+
+def _descriptor(stream: TextIO) -> int | None:
+    """Return the descriptor of a stream, or None for a stream in memory."""
+    try:
+        return stream.fileno()
+    except (AttributeError, io.UnsupportedOperation):
+        return None
 
 
 def _discard(stream: TextIO, *, has_reader: bool) -> None:

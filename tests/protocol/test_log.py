@@ -176,6 +176,19 @@ def test_all_lines_are_there_after_a_flush_where_they_are_read(unread, handler):
     assert received.split() == b" ".join(b"line %d" % number for number in range(20)).split()
 
 
+@pytest.mark.parametrize("level", ["info", "error"])
+def test_end_of_a_process_whose_lines_nothing_reads_keeps_its_exit_code(unread, level):
+    """The writing thread had the lock of the stream, so the interpreter aborted, or waited for ever."""
+    _, written = unread
+    lines = (f"import logging, sys; from {log.__name__} import start_log; start_log('text', 'robot')\n"
+             f"for _ in range(100): logging.getLogger('sightline').{level}(999 * 'x')\n"
+             "logging.shutdown(); sys.stdout.flush(); sys.exit(7)")
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", lines], stdout=written, stderr=written, timeout=20, check=False,
+        env={name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"})
+    assert done.returncode == 7
+
+
 def test_a_level_chooses_its_stream_and_a_stream_without_reader_costs_lines_only(monkeypatch, handler):
     reader, writer = os.pipe()
     os.close(reader)
