@@ -17,7 +17,7 @@ from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints, own_stop_addresses
 from sightline.protocol.transports.flood_limits import limit_floods
 from sightline.protocol.transports.security import ROUTER_ROLE, date_problem, load_role_keys
-from sightline.protocol.transports.stop_port import StopProcess, read_packets, stop_secret_file
+from sightline.protocol.transports.stop_port import StopProcess, read_packets, send_packet, stop_secret_file
 from sightline.protocol.transports.zenoh.session import MAX_ROUTER_SESSIONS, close_without_waiting, open_session
 from sightline.robot_side.guardian import stop_forwarder
 from sightline.robot_side.guardian.stop_core import unpack_ignored
@@ -27,6 +27,8 @@ _log: Final = logging.getLogger(__name__)
 _REACH_S = 5.0
 _WATCHED_S = 1.0
 _DESCRIPTORS: Final = 4 * MAX_ROUTER_SESSIONS
+_PROBE: Final = bytes(256)
+"""A packet that the forwarder ignores. `keep_alive` kills a forwarder that leaves five of them unread."""
 _limiter: Final = RepeatLimiter()
 
 
@@ -81,8 +83,9 @@ def _stop_forwarder(addresses: Sequence[tuple[str, int]], secure: str) -> StopPr
 
 
 def _watch(forwarder: StopProcess) -> None:
-    """Restart the forwarder after its end, and log its reports."""
+    """Restart the forwarder after its end or if it hangs, and log its reports."""
     forwarder.keep_alive(monotonic_us())
+    send_packet(forwarder.near, _PROBE)
     for packet in read_packets(forwarder.near):
         if packet.startswith(b"L"):
             _log.info("router: %s", packet[1:].decode())

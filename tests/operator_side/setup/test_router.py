@@ -1,11 +1,12 @@
 """`sightline router` as a process: robot and vision meet at it; a busy port and a missing key are one line."""
 
+import itertools
 import resource
 import signal
 import subprocess
 import sys
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 
 import pytest
 
@@ -14,7 +15,8 @@ from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.protocol.transports.zenoh.session import MAX_ROUTER_SESSIONS, MAX_SESSIONS, open_session
-from tests.fixtures.links import until
+from sightline.robot_side.guardian import stop_forwarder
+from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_endpoint
 
 
@@ -55,6 +57,25 @@ def test_robot_and_vision_meet_at_a_router_that_ends_on_a_signal(tmp_path, secur
         router.send_signal(signal.SIGTERM)
         assert router.wait(5) == 0
         assert router.stderr.read() == ""
+
+
+def test_hung_stop_forwarder_is_killed_and_one_that_reads_is_left_alone(monkeypatch, caplog):
+    """The forwarder gets no other packets, so nothing else shows that it hangs."""
+    now_s = itertools.count(1000)
+    monkeypatch.setattr(router, "monotonic_us", lambda: next(now_s) * 1_000_000)
+    with closing(stop_forwarder.start([], "")) as forwarder:
+        router._watch(forwarder)
+        for _ in range(10):
+            assert until(lambda: forwarder._unread_bytes() == 0, START_S)
+            router._watch(forwarder)
+        running = forwarder._process
+        assert running.poll() is None
+        running.send_signal(signal.SIGSTOP)
+        for _ in range(7):
+            router._watch(forwarder)
+        assert running.wait(START_S) == -signal.SIGKILL
+        router._watch(forwarder)
+        assert caplog.messages == ["STOP forwarder ended (stopped or hung); starting it again"]
 
 
 def test_router_without_its_keys_reports_the_missing_file(tmp_path):
