@@ -299,7 +299,8 @@ class NetworkSetup(Config):
 class DriverEnd:
     """The driver's end of the pipe. No method waits for the network process, except `close`."""
 
-    def __init__(self, config: RobotConfig, session: str) -> None:
+    def __init__(self, config: RobotConfig, session: str, *, is_restart: bool = False) -> None:
+        """Begin without a network process. After a restart of the driver process the robot had its endpoint open."""
         self._received = False
         self._silent_us = self._kept_us = 0
         self._hung = False
@@ -313,7 +314,7 @@ class DriverEnd:
         self._gone_us = 0
         self._start_at_us = 0
         self._backoff_us = _FIRST_BACKOFF_US
-        self._was_ready = self._is_ready = False
+        self._was_ready, self._is_ready = is_restart, False
         self._camera_fault = ""
         self._camera_patience_us = _FIRST_PATIENCE_US
         self.restarts = -1

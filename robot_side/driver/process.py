@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from functools import partial
 from types import FrameType
-from typing import Any, Final
+from typing import Any, Final, Generic, cast
 
 from sightline.protocol.channels import REQUEST, TWIST
 from sightline.protocol.clock import heartbeat_us, monotonic_us
@@ -50,7 +50,7 @@ from sightline.robot_side.guardian.core import AT_REST, ENDING, FAILED, LOST, MO
 from sightline.robot_side.guardian.start import GuardianEnd, zero_of
 from sightline.robot_side.guardian.stop_core import DriverReport, pack_report, unpack_ignored, unpack_number
 from sightline.robot_side.pipe import DriverEnd
-from sightline.robot_side.plugins import BATTERIES, DRIVES, RANGE_SENSORS
+from sightline.robot_side.plugins import BATTERIES, DRIVES, RANGE_SENSORS, DeviceGroup, Port
 from sightline.robot_side.ports import Battery, Drive, Ranges, RangeSensor, WheelAngles, check_scan, check_wheels
 from sightline.robot_side.safety.battery import BatteryLevel
 from sightline.robot_side.safety.guard import BlindZoneError, check_blind_zone
@@ -89,16 +89,17 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
         check_ports(config.listen)  # before the devices: a second robot on these ports may own the devices, too
     with ExitStack() as last, ExitStack() as ending:
         with slow_logged(f"robot {config.robot}: waiting for the drive {config.motors.kind} to open"):
-            drive: Drive = LostDrive(config.motors) if is_restart else DRIVES.build(config.motors)
+            drive: Drive = LostDrive(DRIVES, config.motors) if is_restart else DRIVES.build(config.motors)
         ending.callback(_close, "drive", drive)
-        ranges = None
-        if config.ranging:
-            with slow_logged(f"robot {config.robot}: waiting for the range sensor {config.ranging.kind} to open"):
-                ranges = RANGE_SENSORS.build(config.ranging)
+        ranges: RangeSensor | None = None
+        if (ranging := config.ranging) is not None:
+            with slow_logged(f"robot {config.robot}: waiting for the range sensor {ranging.kind} to open"):
+                ranges = LostRangeSensor(RANGE_SENSORS, ranging) if is_restart else RANGE_SENSORS.build(ranging)
             ending.callback(_close, "range sensor", ranges)
         threading.stack_size(_PLUGIN_STACK_BYTES)
-        reader = BatteryReader(BATTERIES.build(config.battery)) if config.battery else None
-        if reader is not None:
+        reader = None
+        if (source := config.battery) is not None:
+            reader = BatteryReader(LostBattery(BATTERIES, source) if is_restart else BATTERIES.build(source))
             ending.callback(reader.close)
         threading.stack_size(_STACK_BYTES)
         start_log_thread()
@@ -116,15 +117,41 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
         return driver.loop()
 
 
-class LostDrive:
-    """The drive of a driver process that died. It tries to open the drive; until then `status` shows the error."""
+class LostDevice(Generic[Port]):
+    """A device of a driver process that died. Opens the device, or tries again; until then `status` shows the error.
 
-    def __init__(self, choice: PluginChoice) -> None:
-        self._choice = choice
-        self._drive: Drive | None = None
+    The cause of the death may be a plug that has all devices behind it. The robot then stays reachable, and sets the
+    wheels to zero as soon as it can.
+    """
+
+    def __init__(self, group: DeviceGroup[Port], choice: PluginChoice) -> None:
+        self._group, self._choice = group, choice
+        self._device: Port | None = None
         self._why, self._due_us = "", 0
         with suppress(HardwareError):
             self._opened()
+
+    def close(self) -> None:
+        """Close the device if it is open."""
+        if self._device is not None:
+            cast(Any, self._device).close()
+
+    def _opened(self) -> Port:
+        """Return the device. Raises HardwareError until it opens. It tries once a second."""
+        if self._device is None:
+            if heartbeat_us() < self._due_us:
+                raise HardwareError(self._why)
+            self._due_us = heartbeat_us() + _REOPENS_US
+            try:
+                self._device = self._group.build(self._choice, is_last=False)
+            except HardwareError as error:
+                self._why = str(error)
+                raise
+        return self._device
+
+
+class LostDrive(LostDevice[Drive]):
+    """The drive of a driver process that died."""
 
     def set(self, left_rad_s: float, right_rad_s: float) -> None:
         """Set the wheel speeds, see `Drive`."""
@@ -138,23 +165,21 @@ class LostDrive:
     def zero(config: Mapping[str, Any]) -> None:
         """Do nothing: the guardian calls `zero` of the real drive."""
 
-    def close(self) -> None:
-        """Close the drive if it is open."""
-        if self._drive is not None:
-            self._drive.close()
 
-    def _opened(self) -> Drive:
-        """Return the drive. Raises HardwareError until it opens. It tries once a second."""
-        if self._drive is None:
-            if heartbeat_us() < self._due_us:
-                raise HardwareError(self._why)
-            self._due_us = heartbeat_us() + _REOPENS_US
-            try:
-                self._drive = DRIVES.build(self._choice, is_last=False)
-            except HardwareError as error:
-                self._why = str(error)
-                raise
-        return self._drive
+class LostRangeSensor(LostDevice[RangeSensor]):
+    """The range sensor of a driver process that died."""
+
+    def read(self) -> Ranges | None:
+        """Take the newest scan, see `RangeSensor`."""
+        return self._opened().read()
+
+
+class LostBattery(LostDevice[Battery]):
+    """The battery of a driver process that died."""
+
+    def read(self) -> float:
+        """Measure the voltage, see `Battery`."""
+        return self._opened().read()
 
 
 def _close(part: str, device: Drive | RangeSensor | Battery) -> None:
@@ -250,8 +275,9 @@ class Driver:
         self._battery_reader = battery_reader
         self._logged_level = BatteryLevel.SILENT
         self._driver_core = DriverCore(config, secrets.token_hex(4), stopped=latch.is_set())
+        is_restart = guardian is not None and guardian.is_restart
         # The last process may have been disarmed, or have lost a human. Then only an operator may arm again.
-        self._driver_core.gate.arms_itself &= guardian is None or not guardian.is_restart
+        self._driver_core.gate.arms_itself &= not is_restart
         self._logged_state = self._driver_core.gate.state
         self._is_waiting_logged = self._is_ending_logged = False
         self._ending_since_us: int | None = None
@@ -266,7 +292,7 @@ class Driver:
         self._rejection_limiter = RepeatLimiter()
         self._rejected_by_network: Counter[str] = Counter()
         self._faults_of_network: Counter[str] = Counter()
-        self.driver_end = DriverEnd(config, self._driver_core.session)
+        self.driver_end = DriverEnd(config, self._driver_core.session, is_restart=is_restart)
         self._stops = guardian.stops if guardian else None
         self._stop_applied = 0
         """Number of the receiver's newest STOP that is latched."""

@@ -18,6 +18,7 @@ from sightline.protocol.errors import HardwareError, WireError
 from sightline.protocol.messages import STILL, Holder, Twist
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.driver import process
 from sightline.robot_side.driver.persistence import LatchWriter, StopLatch
 from sightline.robot_side.driver.process import Driver, run
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
@@ -297,6 +298,106 @@ def test_last_heartbeat_permits_a_long_end_only_after_zero(run_with, loop, beat)
         assert unpack_beat(ours.recv(16))[0] == beat
         with suppress(BlockingIOError):
             assert ours.recv(16) == b"", "no other heartbeat follows"
+
+
+class PluggedDevice:
+    """A drive, range sensor and battery behind one plug. It stores its calls."""
+
+    class Config(Config):
+        """Nothing to set."""
+
+    is_plugged = False
+    calls: list[object]
+
+    def __init__(self, _config):
+        self.calls.append("open")
+        if not self.is_plugged:
+            raise HardwareError("no such device")
+
+    @staticmethod
+    def zero(config):
+        pass
+
+    def set(self, *speeds):
+        self.calls.append(speeds)
+
+    def wheels(self):
+        return None
+
+    def read(self):
+        return 12
+
+    def close(self):
+        self.calls.append("close")
+
+
+@pytest.fixture
+def run_unplugged(tmp_path, monkeypatch):
+    """Run a robot whose devices are not there when it starts, with another loop."""
+    handlers = {number: signal.getsignal(number) for number in (*EXIT_SIGNALS, *IGNORED_SIGNALS)}
+    BrokenDrive.fails = BrokenDrive.reading = None
+    monkeypatch.setattr(PluggedDevice, "calls", [], raising=False)
+    monkeypatch.setattr(PluggedDevice, "is_plugged", False)
+    choice = PluginChoice(kind=f"{__name__}:PluggedDevice")
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+
+    def run_unplugged(loop, *groups, is_restart):
+        monkeypatch.setattr(Driver, "loop", loop)
+        ours.send(WATCHED)
+        devices = {"drive": PluginChoice(kind=f"{__name__}:BrokenDrive"), **dict.fromkeys(groups, choice)}
+        config = RobotConfig(listen=(free_endpoint(),), state_dir=tmp_path, **devices)
+        return run(config, GuardianEnd(theirs, is_restart=is_restart))
+
+    with ours, theirs:
+        yield run_unplugged
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+def test_restarted_driver_opens_each_device_as_soon_as_it_is_back(run_unplugged, monkeypatch):
+    """A drive whose plug also has the range sensor was never set to zero, because the robot ended."""
+    now_us = 60_000_000
+    monkeypatch.setattr(process, "heartbeat_us", lambda: now_us)
+    monkeypatch.setattr(process, "BatteryReader", lambda one: SimpleNamespace(read=one.read, close=one.close))
+
+    def loop(driver):
+        nonlocal now_us
+        uses = [lambda: driver._drive.set(0.0, 0.0), driver._ranges.read, driver._battery_reader.read]
+        for passed_us, opens in (0, 3), (999_999, 3), (1, 6), (500_000, 6):
+            now_us += passed_us
+            for use in uses:
+                with pytest.raises(HardwareError, match="no such device"):
+                    use()
+            assert PluggedDevice.calls == ["open"] * opens
+        PluggedDevice.is_plugged = True
+        now_us += 500_000
+        assert [use() for use in uses] == [None, 12, 12] and PluggedDevice.calls[6:] == ["open", (0, 0), "open", "open"]
+        assert driver._drive.wheels() is None
+        return 0
+
+    assert run_unplugged(loop, "drive", "range_sensor", "battery", is_restart=True) == 0
+    assert PluggedDevice.calls[10:] == [(0, 0), "close", "close", "close"]
+
+
+@pytest.mark.parametrize("group", ["drive", "range_sensor", "battery"])
+def test_first_driver_does_not_start_without_a_device(run_unplugged, group):
+    with pytest.raises(HardwareError, match="no such device"):
+        run_unplugged(lambda _driver: pytest.fail("it starts"), group, is_restart=False)
+
+
+def test_device_that_is_still_absent_at_the_end_needs_no_close(run_unplugged):
+    assert run_unplugged(lambda _driver: 0, "range_sensor", is_restart=True) == 0
+    assert PluggedDevice.calls == ["open"]
+
+
+@pytest.mark.parametrize("is_restart", [False, True])
+def test_only_the_first_driver_ends_with_a_network_process_that_does_not_start(run_unplugged, is_restart):
+    """Such as after a camera left together with the drive. Its robot could not be reached."""
+    def loop(driver):
+        driver.driver_end._on_exit(3, 0)
+        return driver.driver_end.exit_code
+
+    assert run_unplugged(loop, is_restart=is_restart) == (0 if is_restart else 3)
 
 
 @pytest.mark.parametrize(("at_rest", "runs", "beats"), [
