@@ -81,7 +81,9 @@ _REPORTED_AT: Final = frozenset(10**power for power in range(10))
 """The 1st, 10th, 100th ... rejection of a kind is logged. A change between good and bad answers is logged, too."""
 _IN_A_ROW: Final = 10
 """After this many good answers or rejections in a row, the log reports a bad server again. Otherwise, if a server
-answers all robots but one, the log would have a line for each frame."""
+answers all robots but one, the log would have a line for each frame. The number of good answers doubles each time."""
+_MOST_IN_A_ROW: Final = 1800
+"""A minute at 30 fps."""
 
 
 class NoAnswerReason(StrEnum):
@@ -120,14 +122,16 @@ class ErrorCounters:
         self._reported = ""
         self._good = self._bad = 0
         """Good and bad answers in a row."""
+        self._good_needed = _IN_A_ROW
 
     def reject(self, error: NoAnswerError) -> None:
         """Count a rejected answer."""
         self.rejected[error.reason] += 1
         count, good_before = self.rejected[error.reason], self._good
         self._good, self._bad = 0, self._bad + 1
-        again = self._reported == "good" and (good_before >= _IN_A_ROW or self._bad == _IN_A_ROW)
+        again = self._reported == "good" and (good_before >= self._good_needed or self._bad == _IN_A_ROW)
         if again or count in _REPORTED_AT:
+            self._good_needed = min(2 * self._good_needed, _MOST_IN_A_ROW) if again else self._good_needed
             self._reported = error.reason
             self.notices.add(f"detector {self._name}: no answer: {error.reason}: {error.detail} ({count} so far)")
 

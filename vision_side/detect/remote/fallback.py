@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from typing import Final
 
 from sightline.protocol.clock import monotonic_us
+from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.transports.link import Link
 from sightline.vision_side.detect.per_robot import MAX_ROBOTS
 from sightline.vision_side.detect.plugin_calls import Notices, attach_detector, close_detector, notices_of
@@ -30,6 +31,9 @@ class Fallback:
         self._first = first if isinstance(first, DeadlineDetector) else DeadlineDetector(first, max_pixels)
         self._second = second
         self._news = Notices()
+        self._returns = RepeatLimiter()
+        self._logged: OrderedDict[str, None] = OrderedDict()
+        """Robots that the second detector steers, according to the log."""
         self._good: OrderedDict[str, int] = OrderedDict()
         """Robots that the second detector steers -> good answers of the first in a row."""
         self._beside: list[tuple[list[str], Pending]] = []
@@ -61,7 +65,8 @@ class Fallback:
             ending.callback(close_detector, self._first)
 
     def notices(self) -> list[str]:
-        """Return the lines of both, and each change between them."""
+        """Return the lines of both, and the changes between them."""
+        self._log_returns()
         return [*notices_of(self._first), *self._news.take(), *notices_of(self._second)]
 
     def _switch(self, robot: str) -> None:
@@ -69,7 +74,20 @@ class Fallback:
         self._good[robot] = 0
         if len(self._good) > MAX_ROBOTS:  # the robot that switched first uses the first detector again
             self._good.popitem(last=False)
-        self._news.add(f"the first detector is late or silent for {robot}: the fallback drives on")
+        if robot not in self._logged:
+            self._logged[robot] = None
+            if len(self._logged) > MAX_ROBOTS:
+                self._logged.popitem(last=False)
+            self._news.add(f"the first detector is late or silent for {robot}: the fallback drives on")
+
+    def _log_returns(self) -> None:
+        """Log that the first detector drives again, immediately and then after 1, 2, 4 ... 60 s."""
+        # Otherwise a first detector that is late now and then would be two lines each time.
+        for robot in [one for one in self._logged if one not in self._good]:
+            if self._returns.due(robot, monotonic_us()):
+                del self._logged[robot]
+                self._news.add(f"the first detector gave {GOOD_ANSWERS} good answers for {robot}: it drives "
+                               "again")
 
     def _filled(self, results: Results, frames: Sequence[DetectFrame], deadline_us: int) -> Results:
         """Fill missing results of the first with those of the second."""
@@ -103,5 +121,3 @@ class Fallback:
             self._good[robot] = self._good[robot] + 1 if good[robot] else 0
             if self._good[robot] >= GOOD_ANSWERS:
                 del self._good[robot]
-                self._news.add(f"the first detector gave {GOOD_ANSWERS} good answers for {robot}: it drives "
-                               "again")

@@ -1,6 +1,7 @@
 """The fallback while a remote does not answer one robot of several: nothing changes for the others."""
 
 import time
+from itertools import pairwise
 
 import pytest
 
@@ -12,6 +13,7 @@ from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.zenoh.link import MAX_ROBOTS as MOST_AT_A_SITE
 from sightline.vision_side.detect.per_robot import MAX_ROBOTS, PerSession
 from sightline.vision_side.detect.port import Maker, result_of
+from sightline.vision_side.detect.remote import fallback as fallback_module
 from sightline.vision_side.detect.remote.fallback import GOOD_ANSWERS, Fallback
 from sightline.vision_side.detect.remote.zenoh_detector import ROLE, ZenohDetector
 from tests.fixtures.vision.remote import frame, within
@@ -39,6 +41,30 @@ def test_a_robot_that_is_not_answered_changes_nothing_for_another():
     remote.unknown.clear()
     drove = [_who(fallback, seq, robot="r2")[0] for seq in range(30, 42)]
     assert drove == ["own"] * GOOD_ANSWERS + ["remote"] * 2, "one beside was under way and not good"
+
+
+def test_remote_that_is_late_now_and_then_is_few_lines_and_the_last_one_is_right(monkeypatch):
+    """It was two lines each time, for ever."""
+    remote, now_us, lines = FakeRemote(), 1_000_000, []
+    monkeypatch.setattr(fallback_module, "monotonic_us", lambda: now_us)
+    fallback = Fallback(remote, Held("own"))
+
+    def steered(frames, late_each):
+        nonlocal now_us
+        for seq in frames:
+            now_us += 33_333
+            remote.state = "none" if seq % late_each == 0 else "good"
+            (detector,) = _who(fallback, seq)
+            lines.extend((now_us, line) for line in fallback.notices())
+        return detector
+
+    steered(range(1, 1800), late_each=12)  # a minute
+    returns_us = [at_us for at_us, line in lines if "it drives again" in line]
+    late = sum("the fallback drives on" in line for _, line in lines)
+    assert len(returns_us) <= 7 and 0 <= late - len(returns_us) <= 1
+    assert all(after - before > 1_000_000 * 2**number for number, (before, after) in enumerate(pairwise(returns_us)))
+    assert steered(range(1801, 4000), late_each=5000) == "remote" and "it drives again" in lines[-1][1]
+    assert steered([5000, 5001], late_each=5000) == "own" and "the fallback drives on" in lines[-1][1]
 
 
 def test_each_robot_of_a_batch_gets_its_result():
@@ -74,6 +100,7 @@ def test_many_robots_need_bounded_memory():
         _who(fallback, 1, robot=f"r{number}")
         _who(fallback, 2, robot=f"r{number}")
     assert len(fallback._good) <= MAX_ROBOTS and len(fallback._beside) <= 1
+    assert len(fallback._logged) <= MAX_ROBOTS
 
 
 def test_session_state_is_stored_for_each_robot():

@@ -65,6 +65,19 @@ def test_one_robot_of_two_that_is_not_answered_is_not_two_lines_for_each_frame()
     assert [line for line in told if "1000 so far" in line] and len(told) == 8
 
 
+def test_server_that_is_late_now_and_then_is_few_lines_in_an_hour_and_a_later_failure_is_reported():
+    tally, told = ErrorCounters("far"), []
+    for frame_number in range(1, 100_000):
+        _refuse(tally, frame_number % 12 == 0)
+        tally.good()
+        told += tally.notices.take()
+    assert len(told) <= 2 * 8
+    for _ in range(1800):
+        tally.good()
+    _refuse(tally, 1)
+    assert "no answer: LATE" in tally.notices.take()[0]
+
+
 class ModelServer(Server):
     """A server of one model, which it may change; with `closes`, it ends every connection after one answer."""
 
