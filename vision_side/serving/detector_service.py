@@ -14,6 +14,7 @@ import os
 import secrets
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -178,6 +179,7 @@ class DetectorService:
         self._maker = (maker.model_hash[:8], maker.device) if maker else ("", "")
         self._load_checked_s = time.monotonic()
         self._load_before = (0, 0)
+        self._offered_before: Counter[str] = Counter()
         self._overloaded = False
         self._busy_ratio = 0.0
         self._duties: dict[str, Duty] = {}
@@ -464,7 +466,11 @@ class DetectorService:
         """Report the begin and the end of an overload."""
         if now_s - self._load_checked_s < _LOAD_PERIOD_S:
             return
-        counters, before = [*self.counters().values(), self._gone], self._load_before
+        robots, before = self.counters(), self._load_before
+        offered = Counter({robot: one.offered for robot, one in robots.items()})
+        most = (offered - self._offered_before).most_common(1)
+        self._offered_before = offered
+        counters = [*robots.values(), self._gone]
         now = sum(one.served for one in counters), sum(one.too_many for one in counters)
         self._load_checked_s, self._load_before = now_s, now
         with self._guard:
@@ -473,8 +479,9 @@ class DetectorService:
         overloaded = dropped > _OVERLOAD * (served + dropped)
         if overloaded != self._overloaded:
             self._overloaded = overloaded
+            sender = "".join(f", most frames from {robot} ({count})" for robot, count in most)
             self._report(f"detector: {'overloaded' if overloaded else 'no longer overloaded'}: {served} "
-                      f"answered, {dropped} dropped in {_LOAD_PERIOD_S:.0f} s")
+                         f"answered, {dropped} dropped in {_LOAD_PERIOD_S:.0f} s{sender}")
 
 
 class _Sharing:

@@ -121,6 +121,25 @@ def test_rejected_request_adds_no_load_and_each_reason_is_logged_once():
     assert bench.tally().rejected == 60 and "overloaded" not in bench.service.about() and len(bench.words) == 3
 
 
+@pytest.mark.parametrize("floods", ["r1", "r2"])
+def test_overload_line_names_the_robot_that_sends_the_most_frames_now(floods):
+    bench = Bench(Named(GOOD))
+    bench.present = ["r1", "r2"]
+    bench.turn()
+    robots = {"r1": bench.robot, "r2": bench.network.link("r2")}
+    for _ in range(20):  # earlier frames of the other robot do not count
+        bench.send(next(link for robot, link in robots.items() if robot != floods))
+        bench.turn()
+    bench.service._check_load(1e9)
+    for robot, link in robots.items():
+        for _ in range(15 if robot == floods else 1):
+            bench.send(link)
+    bench.turn()
+    bench.service._check_load(2e9)
+    line = bench.words[-1]
+    assert line == f"detector: overloaded: 2 answered, 14 dropped in 5 s, most frames from {floods} (15)"
+
+
 def test_a_robot_that_left_is_forgotten_and_its_frames_stay_in_the_totals():
     bench = Bench(Named(GOOD))
     assert bench.look() is not None
