@@ -320,7 +320,7 @@ def collect(
     *,
     is_live: bool = False,
 ) -> Collected[Found]:
-    """Search `pictures` until `enough` new results, or to their end. Report each result.
+    """Search `pictures` until `enough` new results, or to their end. Report each result. Ctrl-C ends live images.
 
     Args:
         finder: returns, for an image size, the function that searches one image.
@@ -331,29 +331,38 @@ def collect(
     """
     found: list[Found] = []
     size, given, skipped, repeated = None, 0, 0, 0
-    for jpeg in pictures:
-        try:
-            own = _size_of(jpeg, size, may_grow=is_live)
-        except ConfigError:
-            if not is_live:
-                raise
-            skipped += 1
-            continue
-        if size is None or own.width_px > size.width_px:
-            size, find, given, skipped, repeated = own, finder(own), 0, skipped + given, 0
-            found.clear()
-        given += 1
-        one = find(jpeg)
-        if one is not None and not is_new(one, found, size):
-            repeated += 1
-        elif one is not None:
-            found.append(one)
-            report(f"{len(found)} of {enough}")
-        if len(found) >= enough:
-            break
+    try:
+        for jpeg in pictures:
+            own = _live_size(jpeg, size) if is_live else _size_of(jpeg, size, may_grow=False)
+            if own is None:
+                skipped += 1
+                continue
+            if size is None or own.width_px > size.width_px:
+                found.clear()  # first, because an interrupted search must not keep views of another size
+                size, find, given, skipped, repeated = own, finder(own), 0, skipped + given, 0
+            given += 1
+            one = find(jpeg)
+            if one is not None and not is_new(one, found, size):
+                repeated += 1
+            elif one is not None:
+                found.append(one)
+                report(f"{len(found)} of {enough}")
+            if len(found) >= enough:
+                break
+    except KeyboardInterrupt:
+        if not found or not is_live:
+            raise
     if size is None:
         raise ConfigError("no image from the camera; run `sightline doctor --camera v4l2`")
     return Collected(size, found, given, skipped, repeated)
+
+
+def _live_size(jpeg: bytes, size: JpegSize | None) -> JpegSize | None:
+    """Return the size of a live image, or None for one that is not usable."""
+    try:
+        return _size_of(jpeg, size, may_grow=True)
+    except ConfigError:
+        return None
 
 
 def _size_of(jpeg: bytes, size: JpegSize | None, *, may_grow: bool) -> JpegSize:

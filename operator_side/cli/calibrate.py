@@ -219,7 +219,7 @@ def camera(
         report = _quiet if as_json else _print_board
         if pictures is None and not as_json:
             searched = "the ball" if ball_radius_m is not None else f"a board of {board} inner corners"
-            typer.echo(f"searching the live images for {searched}, for {seconds:g} s at most; Ctrl-C ends it")
+            typer.echo(f"searching the live images for {searched}, for {seconds:g} s or until Ctrl-C")
         most = _MOST_IN_FOLDER if pictures is not None else views
         made = _measure(source, wanted, mounting, views=most, config=config, report=report, is_live=pictures is None)
     _write(out, made)

@@ -162,6 +162,27 @@ def test_damaged_and_scaled_images_of_a_live_source_are_skipped_and_counted():
         collect(iter(pictures[:1]), *arguments, is_live=True)
 
 
+@pytest.mark.parametrize("interrupted_at", range(5))
+@pytest.mark.parametrize("is_searching", [False, True])
+@pytest.mark.parametrize("is_live", [False, True])
+def test_interrupted_search_in_live_images_returns_what_it_found(interrupted_at, is_searching, is_live):
+    """All boards were lost, though enough of them may be found long before the time ends."""
+    number = iter(range(9))
+
+    def press(at):
+        if is_searching == at and next(number) == interrupted_at:
+            raise KeyboardInterrupt
+        return True
+
+    pictures = (EMPTY for _ in range(9) if press(False))
+    arguments = (pictures, lambda _: lambda _: press(True) or None, lambda *_: True, 9, lambda _: None)
+    if is_live and interrupted_at:
+        assert len(collect(*arguments, is_live=True).found) == interrupted_at
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            collect(*arguments, is_live=is_live)
+
+
 def test_live_source_whose_first_images_are_scaled_begins_again_at_full_size():
     """Flow control may have scaled the images before, and never makes one larger than the camera does."""
     sizes = [JpegSize(160, 120, 3), JpegSize(160, 120, 3), JpegSize(640, 480, 3), JpegSize(320, 240, 3)]
@@ -267,7 +288,7 @@ def test_search_in_live_images_is_announced_with_its_longest_time(
     monkeypatch.setattr(cli_calibrate, "_measure", lambda *_, **__: Calibration(TRUTH, 8, 9, 0.1, "px RMS"))
     live = ("--camera", "still", "--camera-set", f"path={tmp_path / '00.jpg'}", "--seconds", seconds)
     run(*live if seconds else ("--images", tmp_path), *given, "--out", tmp_path / "camera.toml")
-    line = f"searching the live images for {subject}, for 7 s at most; Ctrl-C ends it"
+    line = f"searching the live images for {subject}, for 7 s or until Ctrl-C"
     lines = [one for one in capsys.readouterr().out.splitlines() if one.startswith("search")]
     assert lines == ([line] if seconds and subject else [])
 
