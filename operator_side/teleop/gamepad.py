@@ -5,6 +5,7 @@ Source of the codes: linux/input-event-codes.h, which all gamepads use.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Final
@@ -15,8 +16,13 @@ from sightline.protocol.errors import HardwareError
 EV_SYN: Final = 0
 EV_KEY: Final = 1
 EV_ABS: Final = 3
+SYN_REPORT: Final = 0
 SYN_DROPPED: Final = 3
-"""The kernel dropped events because the reader was slow. A release may be among them."""
+"""The kernel dropped events because the reader was slow. A release may be among them. The events up to the next
+SYN_REPORT are incomplete, and the state of the device must be read again.
+
+Source: Linux kernel, Documentation/input/event-codes.rst.
+"""
 ABS_X, ABS_Y, ABS_RX = 0, 1, 3
 BTN_SOUTH, BTN_EAST, BTN_TL, BTN_TR = 0x130, 0x131, 0x136, 0x137
 _DEAD_MAN: Final = frozenset((BTN_TL, BTN_TR))
@@ -48,14 +54,18 @@ class Pad:
     _stopped: bool = False
     _was_centered: bool = False
     """True if the sticks were at their centers since a shoulder button was pressed."""
+    is_lost: bool = False
+    """True from SYN_DROPPED until `on_state`. Meanwhile only STOP acts."""
 
     def on_event(self, kind: int, code: int, value: int) -> PadKey | None:
         """Process one event. Returns a button with an action. After STOP, a shoulder button must be pressed again."""
-        if kind == EV_ABS and code in self.ranges:
-            self._axes[code] = self._share(code, value)
-        elif (kind, code) == (EV_SYN, SYN_DROPPED):
+        if (kind, code) == (EV_SYN, SYN_DROPPED):
             self._held.clear()
-            self._stopped = False
+            self._stopped, self.is_lost = False, True
+        elif self.is_lost:
+            return PadKey.STOP if (kind, code, value) == (EV_KEY, BTN_EAST, 1) else None
+        elif kind == EV_ABS and code in self.ranges:
+            self._axes[code] = self._share(code, value)
         elif kind == EV_KEY and code in _DEAD_MAN:
             (self._held.add if value else self._held.discard)(code)
             self._stopped &= bool(self._held)
@@ -64,6 +74,17 @@ class Pad:
             return _BUTTONS[code]
         self._was_centered = bool(self._held) and (self._was_centered or self._position == (0.0, 0.0))
         return None
+
+    def on_state(self, axes: Mapping[int, int], keys: Iterable[int] = ()) -> PadKey | None:
+        """Process the present values of the axes and the pressed keys. A shoulder button must be pressed again.
+
+        ABS_RX counts after its first event, because it is a trigger of some gamepads, which is never at a center.
+        """
+        self.is_lost = False
+        for code, value in axes.items():
+            if code != ABS_RX or code in self._axes:
+                self.on_event(EV_ABS, code, value)
+        return PadKey.STOP if BTN_EAST in keys else None
 
     @property
     def shares(self) -> tuple[float, float] | None:
@@ -103,12 +124,9 @@ class Gamepad:
         if ABS_Y not in axes:
             raise HardwareError(f"{self._device.path} ({self._device.name}) has no stick; name a gamepad")
         self.name: str = self._device.name
-        known = (ABS_X, ABS_Y, ABS_RX)
-        self.pad = Pad({code: (info.min, info.max) for code, info in axes.items() if code in known})
-        # The device reports changes only. ABS_RX is a trigger of some gamepads, which is never at a center.
-        for code in (ABS_X, ABS_Y):
-            if code in axes:
-                self.pad.on_event(EV_ABS, code, axes[code].value)
+        known = {code: axes[code] for code in (ABS_X, ABS_Y, ABS_RX) if code in axes}
+        self.pad = Pad({code: (info.min, info.max) for code, info in known.items()})
+        self.pad.on_state({code: info.value for code, info in known.items()})  # the device reports changes only
 
     def fileno(self) -> int:
         """Return the descriptor, for `select`."""
@@ -118,13 +136,25 @@ class Gamepad:
         """Process the waiting events. Raises HardwareError if the gamepad is gone."""
         try:
             events = [(one.type, one.code, one.value) for one in self._device.read()]
+            keys = [self.pad.on_event(*event) for event in events]
+            if self.pad.is_lost and events[-1][:2] == (EV_SYN, SYN_REPORT):
+                keys.append(self._read_state())
         except BlockingIOError:
             return []
         except OSError as error:
             raise HardwareError(
                 f"gamepad {self.name}: {error.strerror}; the robot stops, connect the gamepad again"
             ) from None
-        return [key for event in events if (key := self.pad.on_event(*event)) is not None]
+        return [key for key in keys if key is not None]
+
+    def _read_state(self) -> PadKey | None:
+        """Read axes and keys after lost events.
+
+        This is done after all events that were read, because EVIOCGKEY also removes waiting key events, and an older
+        press must not outlive its release.
+        """
+        keys = self._device.active_keys()
+        return self.pad.on_state({code: self._device.absinfo(code).value for code in self.pad.ranges}, keys)
 
     def close(self) -> None:
         """Close the device."""
