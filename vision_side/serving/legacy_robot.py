@@ -33,12 +33,14 @@ from sightline.protocol.messages import (
     Detections,
     Echo,
     FrameHeader,
+    LeaseHolder,
     Reply,
     Request,
     RequestHeader,
     Stamp,
     State,
     Status,
+    StreamStatus,
     Verb,
     WireModel,
 )
@@ -103,13 +105,15 @@ class LegacyRobotLink(LinkWrapper):
         super().__init__(link)
         self._now_us = now_us
         self._session = secrets.token_hex(4)
+        self._holder = LeaseHolder.of("vision", self._session)  # no other program can drive by this link
         self._lock = threading.Lock()
         self._state, self._reason = State.ACTIVE, _DRIVING
         self._applied = (0.0, 0.0)
         self._is_at_rest, self._zero_us = False, 0
         """True if zero is delivered since the last motion, and the time of the first zero after the motion."""
         self._connection = ""
-        self._accepted = 0
+        self._frames_us: list[int] = []  # arrivals of the last second
+        self._frames = self._accepted = 0
         self._seqs = {STATUS: 0, REPLY: 0}
         # A request that permits motion cites one of these statuses. STOP and disarm clear them.
         self._issued: deque[Echo] = deque(maxlen=_FRESH)
@@ -201,6 +205,8 @@ class LegacyRobotLink(LinkWrapper):
         except WireError:
             return
         with self._lock:
+            self._frames_us.append(now_us)
+            self._frames += 1
             if session != self._connection:  # the earlier connection may have lost the zero
                 self._connection, self._zero_us = session, now_us
             if self._state is State.ACTIVE or self._is_at_rest or now_us - self._zero_us < _IN_FLIGHT_US:
@@ -223,7 +229,11 @@ class LegacyRobotLink(LinkWrapper):
     def _post_status(self) -> None:
         with self._lock:
             state, reason = self._shown()
-            status = Status(state=state, reason=reason, applied=self._applied, accepted=self._accepted)
+            self._frames_us = [one for one in self._frames_us if self._now_us() - one < 1_000_000]
+            status = Status(
+                state=state, reason=reason, holder=self._holder, applied=self._applied, accepted=self._accepted,
+                stream=StreamStatus(sent=self._frames, fps=len(self._frames_us)),
+            )
         self._post(STATUS, status)
 
     def _post(self, channel: Channel, model: WireModel) -> None:

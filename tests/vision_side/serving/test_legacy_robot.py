@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sightline.operator_side.client.status import next_step
 from sightline.operator_side.config.loading import load_service
 from sightline.protocol.channels import DETECTIONS, FRAME, REPLY, REQUEST, STATUS, TWIST
 from sightline.protocol.codec import decode, encode
@@ -93,6 +94,27 @@ def test_commands_pass_from_the_start(bench):
     assert bench.drive() == DRIVE
     _, status = bench.status()
     assert (status.state, status.applied, status.accepted, status.frame_age_us) == ("ACTIVE", (0.2, -0.35), 1, None)
+
+
+@pytest.mark.parametrize("verbs", [(), (Verb.DISARM,), (Verb.STOP,), (Verb.STOP, Verb.RESET)])
+def test_status_names_the_vision_service_and_the_command_that_is_next(bench, verbs):
+    for verb in verbs:
+        bench.request(verb, Echo.of(bench.status()[0]))
+    _, status = bench.status()
+    assert status.holder.source == "vision"
+    command = {"STOPPED": "sightline reset r1", "DISARMED": "sightline arm r1"}
+    assert next_step("r1", status) == command.get(status.state, "")
+
+
+@pytest.mark.parametrize("period_us", [40_000, 200_000, 500_000])
+def test_status_counts_the_images_of_the_last_second(bench, period_us):
+    assert bench.status()[1].stream.fps == 0
+    for count in range(1, 60):
+        bench.image(period_us - 20_000)  # `image` and `status` advance the clock by the rest
+        stream = bench.status()[1].stream
+        assert stream.sent == count and stream.fps == min(count, 1_000_000 // period_us)
+    bench.network.advance(bench.network.now_us + 1_000_000)
+    assert bench.status()[1].stream.fps == 0
 
 
 @pytest.mark.parametrize(("verb", "state"), [(Verb.STOP, "STOPPED"), (Verb.DISARM, "DISARMED")])
