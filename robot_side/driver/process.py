@@ -594,7 +594,7 @@ class Driver:
     def _log_rejection(self, source: str, reason: str, detail: str, times: int = 1) -> None:
         # A driver that sends commands before it is armed is a normal state. One line shows how it ends.
         if reason == RejectReason.DISARMED:
-            if not self._is_waiting_logged:
+            if not (self._is_waiting_logged or self._driver_core.gate.arms_itself):
                 self._is_waiting_logged, robot = True, self._driver_core.config.robot
                 self._log(f"receives commands from {source}; waiting for `sightline arm {robot}`")
             return

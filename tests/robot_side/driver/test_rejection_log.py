@@ -66,3 +66,13 @@ def test_commands_before_arming_are_one_line_that_names_the_next_command(tmp_pat
             assert operator.arm().ok
             assert operator.request(Verb.DISARM).ok
         assert until(lambda: robot.output().count(waiting) == 2, 5), "again after it was armed"
+
+
+def test_robot_that_arms_itself_waits_for_an_operator_only_after_a_disarm(tmp_path):
+    waiting = "receives commands from vision; waiting for `sightline arm r1`"
+    with RobotProcess(tmp_path, safety={"auto_arm": True}) as robot, Vision(robot.endpoint) as vision:
+        assert until(lambda: vision.status().refused.get("DISARMED", 0) > 0 and "ACTIVE" in robot.output(), 10)
+        assert waiting not in robot.output()
+        with open_link("r1", connect=[robot.endpoint], role=SOURCE) as link:
+            assert Operator(link).request(Verb.DISARM).ok
+        assert until(lambda: robot.output().count(waiting) == 1, 5)
