@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any, Final
 
-from sightline.protocol.errors import LinkError, SightlineError
+from sightline.protocol.errors import ConfigError, LinkError, SightlineError
 from sightline.protocol.transports.endpoints import stop_addresses
 from sightline.protocol.transports.stop_datagram import DATAGRAM_BYTES, STOP_SLOW_S, StopRequests
 from sightline.protocol.transports.stop_port import read_secret
@@ -231,6 +231,14 @@ def stop_robot(
                 link.join(_LINK_CLOSES_S)
 
 
+def _can_stop(sender: StopSender, error: SightlineError) -> bool:
+    """Return True if the datagrams may still stop the robot, although the link has failed.
+
+    Without its secret they cannot. Usually `error` is then the cause of both, e.g. keys that are not in the options.
+    """
+    return sender.is_answered and not (sender.lacks_secret and isinstance(error, ConfigError))
+
+
 def _wait(robot: str, sender: StopSender, link: _LinkStop, on_slow: Callable[[], None], timeout_s: float) -> bool:
     began_s = time.monotonic()
     stopped_s: float | None = None
@@ -243,7 +251,7 @@ def _wait(robot: str, sender: StopSender, link: _LinkStop, on_slow: Callable[[],
             has_report = sender.is_answered and not sender.lacks_secret
             if not has_report or now_s - stopped_s > _STORED_S:
                 return not sender.is_stopped
-        elif link.error is not None and not sender.is_answered and now_s - began_s > _ANSWERED_S:
+        elif link.error is not None and now_s - began_s > _ANSWERED_S and not _can_stop(sender, link.error):
             raise link.error
         elif link.ident is None and now_s - began_s > _ANSWERED_S:  # it is applied, but the wheels are not at zero
             link.start()

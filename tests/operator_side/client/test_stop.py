@@ -12,7 +12,7 @@ import pytest
 from sightline.operator_side.client import requests
 from sightline.operator_side.client import stop as client
 from sightline.operator_side.client.stop import StopSender, stop_robot
-from sightline.protocol.errors import LinkError, RejectReason, WireError
+from sightline.protocol.errors import ConfigError, LinkError, RejectReason, WireError
 from sightline.protocol.messages import State, Status
 from sightline.protocol.transports import open as open_module
 from sightline.protocol.transports import stop_port
@@ -227,6 +227,20 @@ def test_a_missing_secret_is_named(robot, link, port):
     robot(secret=b"a secret of this site")
     with pytest.raises(LinkError, match=r"copy stop\.secret"):
         stop(port, timeout_s=0.4)
+
+
+def test_options_without_keys_are_named_in_place_of_a_missing_secret(robot, link, port):
+    robot(secret=b"a secret of this site")
+    link.error = ConfigError("a tls/ endpoint needs keys; pass --secure DIR")
+    with pytest.raises(ConfigError, match="pass --secure DIR"):
+        stop(port)
+
+
+@pytest.mark.parametrize("options", [{}, {"turns_s": 1.5}])
+def test_options_without_keys_do_not_end_a_stop_that_the_robot_accepts(robot, link, port, options):
+    robot(**options)
+    link.error = ConfigError("a tls/ endpoint needs keys; pass --secure DIR")
+    assert stop(port)
 
 
 def test_without_the_secret_the_link_alone_proves_the_stop(robot, link, port, monkeypatch):
