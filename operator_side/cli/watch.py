@@ -35,6 +35,7 @@ from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import open_link
 
 if TYPE_CHECKING:
+    from sightline.operator_side.recording.film import Cut
     from sightline.operator_side.recording.recorder import Recorder
 
 _TARGET = "target"
@@ -195,8 +196,8 @@ def capture(
     with open_link(robot, connect=target.connect, role=role, secure=secure) as link:
         length_s = _SECONDS if seconds is None else seconds
         if path.suffix.lower() == MESSAGES:
-            recorder = record(link, Pictures(link, role, FRAME, secure), path, wanted, length_s)
-            _print_recording(robot, path, recorder, as_json)
+            recorder, cut = record(link, Pictures(link, role, FRAME, secure), path, wanted, length_s)
+            _print_recording(robot, path, recorder, cut, as_json)
             return
         pictures = Pictures(link, role, wanted, secure)
         if path.suffix.lower() in PICTURES:
@@ -204,8 +205,7 @@ def capture(
         else:
             got = film(pictures, path, wanted, length_s)
     if got.cut == "silent":
-        typer.echo(f"capture: no more images after {got.seconds:.1f} s, so the video is shorter than requested; run "
-                   f"`sightline status {robot}`", err=True)
+        _warn_silent("images", got.seconds, "video", robot)
     if as_json:
         typer.echo(json.dumps({"robot": robot, "file": str(path), "channel": wanted.name, "frames": got.frames,
                                "seconds": round(got.seconds, 3), "width_px": got.width_px, "height_px": got.height_px,
@@ -215,13 +215,20 @@ def capture(
     typer.echo(f"{path}: {wanted.name} of {robot}, {got.width_px}x{got.height_px}{length}")
 
 
-def _print_recording(robot: str, path: Path, recorder: "Recorder", as_json: bool) -> None:
+def _warn_silent(what: str, seconds: float, file: str, robot: str) -> None:
+    typer.echo(f"capture: no more {what} after {seconds:.1f} s, so the {file} is shorter than requested; run "
+               f"`sightline status {robot}`", err=True)
+
+
+def _print_recording(robot: str, path: Path, recorder: "Recorder", cut: "Cut", as_json: bool) -> None:
     counts = recorder.counts
+    if cut == "silent":
+        _warn_silent("messages", recorder.seconds, "recording", robot)
     if recorder.dropped:
         typer.echo(f"capture: {recorder.dropped} messages are missing, because {path} is on a slow disk", err=True)
     if as_json:
         typer.echo(json.dumps({"robot": robot, "file": str(path), "messages": counts, "dropped": recorder.dropped,
-                               "complete": not recorder.dropped}))
+                               "seconds": round(recorder.seconds, 3), "complete": not (recorder.dropped or cut)}))
         return
     listed = ", ".join(f"{topic} {count}" for topic, count in sorted(counts.items()))
     typer.echo(f"{path}: {sum(counts.values())} messages of {robot}: {listed}")

@@ -146,7 +146,7 @@ _WAIT_S: Final = 0.5
 _FPS: Final = 30
 _SHORT_S: Final = 1.0  # longest gap in the status of a present robot
 Cut = Literal["", "interrupted", "silent"]
-"""Why a film is shorter than requested: the user ended it, or no more images came."""
+"""Why a film or recording is shorter than requested: the user ended it, or nothing more came."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +204,7 @@ def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Cap
     return Captured(path, made.frames, made.seconds, *made.size_px, cut)
 
 
-def record(link: Link, pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Recorder:
+def record(link: Link, pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> tuple[Recorder, Cut]:
     """Write the messages of `seconds`, or until Ctrl-C, SIGTERM or SIGHUP, to `path`. `wanted` may add the overlay.
 
     A file that is there already stays until then. Raises LinkError if none arrives, KeyboardInterrupt if Ctrl-C comes
@@ -215,12 +215,14 @@ def record(link: Link, pictures: Pictures, path: Path, wanted: Channel, seconds:
     beside = whole(target, MESSAGES) if target.is_file() else nullcontext(target)
     ends_s, has_begun = time.monotonic() + PATIENCE_S, False  # the end is counted from the first message
     channels = dict.fromkeys((*RECORDED, wanted))
+    cut: Cut = "interrupted"
     with _terminated_like_ctrl_c(), writes(path), _locked(target), beside as part:
         with Recorder(link, part, {"robot": link.robot}, channels) as recorder, suppress(KeyboardInterrupt):
             while (left_s := ends_s - time.monotonic()) > 0 and not recorder.failed:
                 pictures.take(min(left_s, _WAIT_S))  # it acknowledges frames; without a vision service no client does
                 if recorder.counts and not has_begun:
                     ends_s, has_begun = time.monotonic() + seconds, True
+            cut = ""
         if not (recorder.failed or recorder.counts):
             part.unlink()
             raise KeyboardInterrupt if time.monotonic() < ends_s else LinkError(_silence(pictures, wanted))
@@ -229,7 +231,7 @@ def record(link: Link, pictures: Pictures, path: Path, wanted: Channel, seconds:
             kept = part.rename(part.with_name(part.name.removeprefix("."))) if is_beside else path
             raise ConfigError(f"recording {kept} ends early: {recorder.failed}; "
                               + f"{path} is unchanged; " * is_beside + "free some space or name another file")
-    return recorder
+    return recorder, cut or _ended(seconds, recorder.seconds)
 
 
 @contextmanager
@@ -266,7 +268,12 @@ def _fill(made: Film, pictures: Pictures, wanted: Channel, seconds: float) -> Cu
         if not made.frames:
             raise
         return "interrupted"
-    return "silent" if seconds - made.seconds > _SHORT_S else ""
+    return _ended(seconds, made.seconds)
+
+
+def _ended(wanted_s: float, made_s: float) -> Cut:
+    """Return the end of a film or recording that the user did not end."""
+    return "silent" if wanted_s - made_s > _SHORT_S else ""
 
 
 @contextmanager

@@ -76,6 +76,7 @@ class Recorder:
         self._writer, self._about = _writer(self._file), dict(about)
         self._ids: dict[tuple[str, str], int] = {}
         self._counts: dict[str, int] = {}
+        self._span_ns: tuple[int, int] | None = None  # first and last message
         self.dropped = 0
         """Number of messages dropped because the disk was too slow."""
         self.failed = ""
@@ -92,6 +93,12 @@ class Recorder:
     def counts(self) -> dict[str, int]:
         """Return the number of written messages of each topic."""
         return dict(self._counts)
+
+    @property
+    def seconds(self) -> float:
+        """Return the time from the first written message to the last."""
+        first_ns, last_ns = self._span_ns or (0, 0)
+        return (last_ns - first_ns) / 1e9
 
     def _take(self, message: Message) -> None:
         if self._closed or self.failed:
@@ -134,6 +141,7 @@ class Recorder:
             encoding, data = ENCODING, _LENGTH.pack(len(message.header)) + message.header + message.payload
         number = self._channel_id(topic, encoding, message.channel)
         self._writer.add_message(number, log_time_ns, data, log_time_ns, count)
+        self._span_ns = (self._span_ns or (log_time_ns, 0))[0], log_time_ns
         pose = foxglove.transform(message, log_time_ns)
         if pose is not None:
             number = self._channel_id(foxglove.TRANSFORM, foxglove.ENCODING, None)

@@ -297,7 +297,8 @@ def status(number: int) -> Message:
 def test_recording_has_each_message_of_its_time(tmp_path: Path, wanted) -> None:
     path, messages = tmp_path / "run.mcap", [status(1), Message(FRAME, "", b"{}", NOISE), status(2)]
     robot = Talking(messages[:1], messages[1:])
-    recorder = record(robot, robot, path, wanted, 0.05)
+    recorder, cut = record(robot, robot, path, wanted, 0.05)
+    assert cut == ""
     assert set(robot.callbacks) == {*RECORDED, wanted}
     assert [one.message for one in read_recording(path)] == messages
     assert read_about(path) == {"robot": "r1"} and recorder.counts == {"status": 2, "frame": 1}
@@ -308,7 +309,7 @@ def test_recording_has_each_message_of_its_time(tmp_path: Path, wanted) -> None:
 def test_ended_recording_is_kept(tmp_path: Path, number: signal.Signals) -> None:
     robot = Talking([status(1)], [status(2), lambda: signal.raise_signal(number)], [status(3)])
     before = signal.getsignal(number)
-    record(robot, robot, tmp_path / "run.mcap", FRAME, 60.0)
+    assert record(robot, robot, tmp_path / "run.mcap", FRAME, 60.0)[1] == "interrupted"
     assert [one.message for one in read_recording(tmp_path / "run.mcap")] == [status(1), status(2)]
     assert signal.getsignal(number) is before
 
@@ -387,13 +388,13 @@ def test_recording_needs_no_locks_of_the_file_system(monkeypatch, tmp_path: Path
 
     monkeypatch.setattr("fcntl.flock", without_locks)
     robot = Talking([status(1)])
-    assert record(robot, robot, tmp_path / "run.mcap", FRAME, 0.01).counts == {"status": 1}
+    assert record(robot, robot, tmp_path / "run.mcap", FRAME, 0.01)[0].counts == {"status": 1}
 
 
 def test_recording_has_its_length_from_the_first_message_on(tmp_path: Path) -> None:
     robot = Talking([lambda: time.sleep(0.2)], [status(1), lambda: time.sleep(0.03)])
     begin_s = time.monotonic()
-    recorder = record(robot, robot, tmp_path / "run.mcap", FRAME, 0.1)
+    recorder, _ = record(robot, robot, tmp_path / "run.mcap", FRAME, 0.1)
     assert recorder.counts == {"status": 1} and 0.3 < time.monotonic() - begin_s < 3
 
 
@@ -422,9 +423,40 @@ def test_recording_on_a_full_disk_keeps_the_earlier_file_and_its_own_beginning(t
     assert kept.name.startswith(".") is (name == ".run.mcap")
 
 
+class Clock:
+    """Replaces the module `time` in film and recorder."""
+
+    def __init__(self, monkeypatch) -> None:
+        self.now_ms = 5_000
+        for module in ("film", "recorder"):
+            monkeypatch.setattr(f"sightline.operator_side.recording.{module}.time", self)
+
+    def monotonic(self) -> float:
+        return self.now_ms / 1000
+
+    def monotonic_ns(self) -> int:
+        return self.now_ms * 1_000_000
+
+    time_ns = monotonic_ns
+
+    def advance(self) -> None:
+        self.now_ms += 100
+
+
+@pytest.mark.parametrize(("last_ms", "cut"), [(0, "silent"), (100, "silent"), (1900, "silent"), (2000, ""), (3000, "")])
+def test_recording_whose_messages_end_early_is_reported(monkeypatch, tmp_path: Path, last_ms: int, cut: Cut) -> None:
+    clock = Clock(monkeypatch)
+    turns = [[status(at)] * (at <= last_ms) + [clock.advance] for at in range(0, 9_000, 100)]
+    recorder, found = record(robot := Talking(*turns), robot, tmp_path / "run.mcap", FRAME, 3.0)
+    assert (recorder.seconds, found) == (last_ms / 1000, cut)
+
+
 @pytest.mark.parametrize("overlay", [False, True])
+@pytest.mark.parametrize("cut", ["", "interrupted", "silent"])
 @pytest.mark.parametrize("dropped", [0, 3])
-def test_capture_prints_what_it_recorded(monkeypatch, capsys, tmp_path: Path, overlay: bool, dropped: int) -> None:
+def test_capture_prints_what_it_recorded(
+    monkeypatch, capsys, tmp_path: Path, overlay: bool, dropped: int, cut: Cut
+) -> None:
     """The images of the recorder are always frames: taken overlays would end its subscription to frames."""
     file, robot, taken = tmp_path / "run.MCAP", Talking(), []
     monkeypatch.setattr(watch, "open_link", lambda *_given, **_more: nullcontext(robot))
@@ -432,14 +464,17 @@ def test_capture_prints_what_it_recorded(monkeypatch, capsys, tmp_path: Path, ov
 
     def recorded(*given):
         assert given == (robot, robot, file, OVERLAY if overlay else FRAME, 5.0)
-        return SimpleNamespace(counts={"status": 2, "frame": 1}, dropped=dropped)
+        return SimpleNamespace(counts={"status": 2, "frame": 1}, dropped=dropped, seconds=2.0), cut
 
     monkeypatch.setattr("sightline.operator_side.recording.film.record", recorded)
     command = ("capture", "r1", "--connect", "tcp/127.0.0.1:1", "--out", str(file), *["--overlay"] * overlay)
     code, out, err = run(capsys, *command)
     assert (code, out) == (0, f"{file}: 3 messages of r1: frame 1, status 2\n") and taken == [FRAME]
-    assert err == (f"capture: 3 messages are missing, because {file} is on a slow disk\n" if dropped else "")
+    silent = ("capture: no more messages after 2.0 s, so the recording is shorter than requested; "
+              "run `sightline status r1`")
+    slow = f"capture: 3 messages are missing, because {file} is on a slow disk"
+    assert err.splitlines() == [silent] * (cut == "silent") + [slow] * bool(dropped)
     assert json.loads(run(capsys, *command, "--json")[1]) == {
         "robot": "r1", "file": str(file), "messages": {"status": 2, "frame": 1}, "dropped": dropped,
-        "complete": not dropped,
+        "seconds": 2.0, "complete": not (dropped or cut),
     }
