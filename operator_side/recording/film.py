@@ -196,7 +196,7 @@ def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Cap
     The capture times determine its length, so a late first image does not make the film longer.
     """
     target = Path(os.path.realpath(path))  # a symbolic link is preserved
-    with _terminated_like_ctrl_c(), writes(path), whole(target, VIDEO) as part:
+    with _interrupted_once(), writes(path), whole(target, VIDEO) as part:
         with Film(part, _FPS) as made:
             cut = _fill(made, pictures, wanted, seconds)
         if not made.frames:
@@ -216,7 +216,7 @@ def record(link: Link, pictures: Pictures, path: Path, wanted: Channel, seconds:
     ends_s, has_begun = time.monotonic() + PATIENCE_S, False  # the end is counted from the first message
     channels = dict.fromkeys((*RECORDED, wanted))
     cut: Cut = "interrupted"
-    with _terminated_like_ctrl_c(), writes(path), _locked(target), beside as part:
+    with _interrupted_once(), writes(path), _locked(target), beside as part:
         with Recorder(link, part, {"robot": link.robot}, channels) as recorder, suppress(KeyboardInterrupt):
             while (left_s := ends_s - time.monotonic()) > 0 and not recorder.failed:
                 pictures.take(min(left_s, _WAIT_S))  # it acknowledges frames; without a vision service no client does
@@ -277,15 +277,16 @@ def _ended(wanted_s: float, made_s: float) -> Cut:
 
 
 @contextmanager
-def _terminated_like_ctrl_c() -> Iterator[None]:
-    """Convert SIGTERM and SIGHUP to KeyboardInterrupt, and ignore further ones: a closed terminal sends two."""
+def _interrupted_once() -> Iterator[None]:
+    """Convert the first Ctrl-C, SIGTERM or SIGHUP to KeyboardInterrupt. A second one must not lose the file."""
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
         for number in before:
             signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    numbers = [one for one in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(one) is not signal.SIG_IGN]  # nohup
+    ending = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    numbers = [one for one in ending if signal.getsignal(one) is not signal.SIG_IGN]  # nohup
     before = {number: signal.getsignal(number) for number in numbers}
     try:
         for number in numbers:

@@ -86,8 +86,8 @@ def hangs_up() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("hangs_up")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_terminated_film_is_kept_as_after_ctrl_c(tmp_path: Path, number: signal.Signals) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_film_is_kept_although_its_signal_comes_again(tmp_path: Path, number: signal.Signals) -> None:
     class Terminated(Played):
         def take(self, seconds: float) -> Shot:
             shot = super().take(seconds)
@@ -99,7 +99,7 @@ def test_terminated_film_is_kept_as_after_ctrl_c(tmp_path: Path, number: signal.
     close = Film.close
 
     def closed(made: Film) -> None:
-        signal.raise_signal(number)  # a closed terminal sends it again
+        signal.raise_signal(number)  # a closed terminal and `timeout` send it again, or an impatient user
         ended.append(made)
         close(made)
 
