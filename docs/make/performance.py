@@ -315,9 +315,11 @@ def _machine() -> str:
 
 
 def processor() -> str:
-    """Return the model of the CPU."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    return next((line.partition(": ")[2] for line in lines if line.startswith("model name")), platform.machine())
+    """Return the CPU's name, and its family and model: virtual machines give CPUs of several generations one name."""
+    table = Path("/proc/cpuinfo")
+    known = dict(re.findall(r"^([^\t:]+)\t*: (.+)$", table.read_text(), re.MULTILINE)) if table.exists() else {}
+    name = known.get("model name", platform.machine())
+    return f"{name} (family {known['cpu family']}, model {known['model']})" if "cpu family" in known else name
 
 
 def _command(section: Section) -> str:
