@@ -1,13 +1,16 @@
 """The device groups of the robot. A plug-in is found by entry point or `package.module:Name`. Shell."""
 
+import logging
 from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
 
-from sightline.protocol.config import PLUGIN_ERRORS, PluginRegistry
+from sightline.protocol.config import PluginRegistry
 from sightline.protocol.errors import ConfigError, HardwareError, SightlineError
 from sightline.protocol.log import error_text, report_ending
 from sightline.robot_side.config import PluginChoice
 from sightline.robot_side.ports import Battery, Camera, Drive, RangeSensor
+
+_log: Final = logging.getLogger(__name__)
 
 Port = TypeVar("Port")
 
@@ -32,13 +35,17 @@ class DeviceGroup(Generic[Port]):
         Raises:
             ConfigError: for an unknown kind (nearest named), a missing package, method or wrong option.
             HardwareError: from the device, or for any other exception of it.
+            KeyboardInterrupt: with `is_last`, from Ctrl-C. Other processes ignore or block its signal.
         """
         plugin, config = self.load(choice)
         try:
             device: Port = plugin(config)
         except SightlineError:
             raise
-        except PLUGIN_ERRORS as error:
+        except BaseException as error:
+            if is_last and isinstance(error, KeyboardInterrupt):  # usually Ctrl-C
+                _log.warning("interrupted while the %s %s opened", self.noun, choice.kind)
+                raise
             if is_last:
                 report_ending(self.noun, error)
             raise self.failed(choice, error) from error

@@ -8,6 +8,7 @@ import inspect
 import math
 import re
 import tomllib
+from asyncio import CancelledError
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,6 +53,12 @@ def test_error_of_an_unknown_kind_names_each_kind_that_the_configuration_takes(g
     assert ("none" in named) == switched_off
 
 
+ERRORS = {
+    "": ValueError("no\n\x1bport"), "exit": SystemExit(0), "cancel": CancelledError("gone"), "end": GeneratorExit(),
+    "interrupt": KeyboardInterrupt(),
+}
+
+
 class OddDevice:
     """Raises as configured."""
 
@@ -60,7 +67,7 @@ class OddDevice:
 
     def __init__(self, config):
         if config.raises != "nothing":
-            raise {"": ValueError("no\n\x1bport"), "exit": SystemExit(0)}[config.raises]
+            raise ERRORS[config.raises]
 
     def __getattr__(self, name):
         if name == "read":
@@ -68,12 +75,27 @@ class OddDevice:
         raise AttributeError(name)
 
 
-@pytest.mark.parametrize(("raises", "text"), [("", "ValueError: no ?port"), ("exit", "SystemExit: 0")])
-def test_exception_of_a_device_at_its_start_is_one_line_that_names_it(raises, text):
+TEXTS = [("", "ValueError: no ?port"), ("exit", "SystemExit: 0"), ("cancel", "CancelledError: gone"),
+         ("end", "GeneratorExit: GeneratorExit")]
+
+
+@pytest.mark.parametrize(("raises", "text", "is_last"), [
+    *((*row, is_last) for row in TEXTS for is_last in (True, False)),
+    ("interrupt", "KeyboardInterrupt: KeyboardInterrupt", False),
+])  # fmt: skip
+def test_exception_of_a_device_at_its_start_is_one_line_that_names_it(caplog, raises, text, is_last):
     choice = PluginChoice(kind=f"{__name__}:OddDevice", options={"raises": raises})
     with pytest.raises(HardwareError) as caught:
-        BATTERIES.build(choice)
+        BATTERIES.build(choice, is_last=is_last)
     assert str(caught.value) == f"battery '{choice.kind}' raised {text}"
+    assert len(caplog.records) == is_last
+
+
+def test_interrupt_while_a_device_opens_ends_the_program_with_a_line_that_names_it(caplog):
+    kind = f"{__name__}:OddDevice"
+    with pytest.raises(KeyboardInterrupt):
+        BATTERIES.build(PluginChoice(kind=kind, options={"raises": "interrupt"}))
+    assert caplog.messages == [f"interrupted while the battery {kind} opened"]
 
 
 def test_device_without_a_method_of_its_port_is_rejected_and_may_have_it_in_any_way():
