@@ -1,9 +1,12 @@
 """The STOP latch on disk, and the thread that writes it without blocking the control loop. Shell."""
 
 import errno
+import fcntl
 import logging
 import os
 import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -54,6 +57,25 @@ class StopLatch:
                 raise
         finally:
             os.close(folder)
+
+
+@contextmanager
+def state_locked(directory: Path, robot: str) -> Iterator[None]:
+    """Lock the mark of a robot until the end of the block. Log if another robot has it.
+
+    The lock is advice: a folder that is read-only, or cannot lock, has none. The kernel removes it with its process.
+    """
+    with ExitStack() as ending:
+        try:
+            lock = os.open(home_path(directory) / f"{robot}.lock", os.O_RDWR | os.O_CREAT, 0o644)
+            ending.callback(os.close, lock)
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            _log.warning("another robot with the id %s uses state_dir %s, so a reset of one removes the STOP mark of "
+                         "the other; give each its own --robot ID or --set state_dir=DIR", robot, directory)
+        except OSError as error:
+            _log.debug("no lock in state_dir %s: %s", directory, error.strerror)
+        yield
 
 
 _RETRY_S: Final = 0.5

@@ -38,7 +38,7 @@ from sightline.protocol.transports.stop_port import read_packets, send_packet
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.core import DriverCore
-from sightline.robot_side.driver.persistence import LatchWriter, StopLatch
+from sightline.robot_side.driver.persistence import LatchWriter, StopLatch, state_locked
 from sightline.robot_side.driver.supervision import (
     DRIVER_PRIORITY,
     EXIT_SIGNALS,
@@ -104,6 +104,7 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
         threading.stack_size(_STACK_BYTES)
         start_log_thread()
         driver = Driver(config, drive, ranges, reader, guardian)
+        last.enter_context(state_locked(config.state_dir, config.robot))
         last.callback(driver.finish)  # once more, because closing devices and network process may take seconds
         threading.stack_size(_PLUGIN_STACK_BYTES)
         ending.callback(driver.latch_writer.close)

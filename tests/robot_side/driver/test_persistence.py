@@ -1,6 +1,7 @@
 """The STOP mark is on the disk itself, not only in the kernel's memory, when it counts as kept."""
 
 import errno
+import fcntl
 import os
 import stat
 import threading
@@ -8,8 +9,9 @@ import threading
 import pytest
 
 from sightline.protocol.errors import ConfigError
-from sightline.robot_side.driver.persistence import LatchWriter, StopLatch
+from sightline.robot_side.driver.persistence import LatchWriter, StopLatch, state_locked
 from tests.fixtures.links import until
+from tests.fixtures.robot_process import RobotProcess
 
 
 @pytest.fixture
@@ -84,6 +86,36 @@ def test_a_mark_that_cannot_be_read_is_an_error_and_not_a_robot_without_stop(tmp
         with pytest.raises(ConfigError) as error:
             latch.is_set()
     assert str(error.value).startswith(f"cannot read the STOP mark {tmp_path}/r1.stopped: {os.strerror(number)}; ")
+
+
+def test_second_robot_with_the_same_mark_is_warned_and_no_other(tmp_path, caplog):
+    (tmp_path / "other").mkdir()
+    with state_locked(tmp_path, "r1"), state_locked(tmp_path, "r2"), state_locked(tmp_path / "other", "r1"):
+        assert caplog.messages == []
+        with state_locked(tmp_path, "r1"):
+            assert caplog.messages == [
+                f"another robot with the id r1 uses state_dir {tmp_path}, so a reset of one removes the STOP mark of "
+                "the other; give each its own --robot ID or --set state_dir=DIR"
+            ]
+    caplog.clear()
+    with state_locked(tmp_path, "r1"):
+        assert caplog.messages == []
+
+
+def test_robot_warns_of_another_one_with_its_mark(tmp_path):
+    (tmp_path / "state").mkdir()
+    with state_locked(tmp_path / "state", "r1"), RobotProcess(tmp_path, guarded=False) as robot:
+        robot.wait_until_on(f"another robot with the id r1 uses state_dir {tmp_path / 'state'}")
+
+
+@pytest.mark.parametrize("step", ["open", "flock"])
+def test_robot_starts_with_a_folder_that_cannot_lock(tmp_path, caplog, monkeypatch, step):
+    def fails(*_arguments):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr({"open": os, "flock": fcntl}[step], step, fails)
+    with state_locked(tmp_path, "r1"):
+        assert not any(record.levelname == "WARNING" for record in caplog.records)
 
 
 # A terminal that is not read, and a write that fails, do not end the writing of the STOP mark.
