@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
-from sightline.protocol.errors import ConfigError, SightlineError
+from sightline.protocol.errors import ConfigError, SightlineError, home_path
 from sightline.protocol.log import error_text, report_ending
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 PLUGIN_ERRORS: Final = (Exception, SystemExit)
 """Errors of plug-in code. A `sys.exit` in a plug-in must end only the plug-in, not the service."""
 _LONGEST_DETAIL: Final = 160
+_MAX_FILE_BYTES: Final = 1_000_000
 _TYPE_NAMES: Final = {"model_type": "a table", "dict_type": "a table", "tuple_type": "a list", "list_type": "a list",
                       "string_type": "text"}
 """Type of a pydantic error -> the term in TOML, because the messages of pydantic name Python types and classes."""
@@ -57,6 +58,18 @@ class Config(BaseModel):
         return {key: value for key, value in given.items() if key not in cls.renamed_keys} | {
             new: given[old] for old, new in cls.renamed_keys.items() if old in given
         }
+
+
+def file_text(path: str | Path) -> str:
+    """Return the text of a TOML file. Raises OSError, and ConfigError for a file that is too large or not UTF-8."""
+    with home_path(path).open("rb") as file:
+        data = file.read(_MAX_FILE_BYTES + 1)
+    if len(data) > _MAX_FILE_BYTES:
+        raise ConfigError(f"{path}: more than {_MAX_FILE_BYTES} bytes; name a TOML file")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: not a text file in UTF-8; save it as UTF-8") from None
 
 
 @cache

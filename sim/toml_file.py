@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from sightline.protocol.config import file_text
 from sightline.protocol.errors import ConfigError
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -49,7 +50,7 @@ def read_table(path: Path, folder: Path | None = None) -> dict[str, Any]:
     Raises ConfigError with the file and the line of invalid TOML.
     """
     try:
-        table = tomllib.loads(path.read_text("utf-8-sig"))
+        table = tomllib.loads(file_text(path))
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}; name a TOML file that you may read") from None
     except (ValueError, RecursionError) as error:  # also a number with too many digits

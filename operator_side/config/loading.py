@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from sightline.operator_side.config.context import CONNECT_VARIABLE
 from sightline.operator_side.config.errors import explain, is_known, known_keys, no_such_name, wrong_type
 from sightline.operator_side.config.toml_text import key_and_text, parse_toml, toml_value
-from sightline.protocol.config import Config
+from sightline.protocol.config import Config, file_text
 from sightline.protocol.errors import ConfigError, home_path
 from sightline.protocol.log import LOG_FORMAT_VARIABLE
 from sightline.protocol.transports.endpoints import check_endpoint, check_robot_id
@@ -134,17 +134,15 @@ def _from_file(file: str, origin: str) -> Iterable[Given]:
         raise ConfigError("the name of the configuration file is empty; name a TOML file, or leave out --config")
     try:
         return [Given(key, value, origin)
-                for key, value in _leaves(parse_toml(home_path(file).read_text("utf-8-sig")))]
+                for key, value in _leaves(parse_toml(file_text(file)))]
     except OSError as error:
         raise ConfigError(f"cannot read {file}: {error.strerror}; name a TOML file that you may read") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ConfigError(f"{file}: invalid TOML: {error}{_fix_of(file, error)}") from None
 
 
 def _fix_of(file: str, error: Exception) -> str:
-    """Return the fix for another encoding, and for a number with a decimal comma in the line of the error, or ""."""
-    if isinstance(error, UnicodeDecodeError):
-        return "; save it as UTF-8"
+    """Return the fix for a number with a decimal comma in the line of the error, or ""."""
     place = re.search(r"at line (\d+)", str(error))
     lines = home_path(file).read_text("utf-8").splitlines() if place else []
     found = re.search(r"=\s*(-?\d+),(\d+)\s*(#|$)", lines[int(place[1]) - 1]) if place and lines else None
@@ -287,7 +285,8 @@ def _typed(given: Mapping[Key, Given], key: Key) -> Key:
 
 def _label(given: Mapping[Key, Given], key: Key) -> str:
     """Name `key` and its source as written; for a missing key, name the file of its neighbors."""
-    one, dotted = given_at(given, key), ".".join(key)
+    inside = (one for at, one in given.items() if at[: len(key)] == key)  # a table in place of a value
+    one, dotted = given_at(given, key) or next(inside, None), ".".join(key)
     if one is None:
         beside = (one.origin for at, one in given.items() if len(key) > 1 and at[: len(key) - 1] == key[:-1])
         file = next((origin for origin in beside if not origin.startswith((ENV_PREFIX, "--"))), "")

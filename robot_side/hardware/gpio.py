@@ -19,8 +19,8 @@ from typing import Annotated, Any, Final, Literal, Protocol, Self
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from sightline.protocol.clock import monotonic_us
-from sightline.protocol.config import Config, first_problem
-from sightline.protocol.errors import ConfigError, HardwareError, home_path, install_command
+from sightline.protocol.config import Config, file_text, first_problem
+from sightline.protocol.errors import ConfigError, HardwareError, install_command
 from sightline.robot_side.hardware.gpio_low import import_lgpio, leave_low, zero
 from sightline.robot_side.ports import WheelAngles
 
@@ -47,6 +47,12 @@ class TableConfig(Config):
             if more_duty <= duty or more_speed <= speed:
                 raise ValueError(f"[{more_duty:g}, {more_speed:g}] after [{duty:g}, {speed:g}]: both must rise")
         return rows
+
+
+class _TableFile(TableConfig):
+    """A table file must have a table. An empty one must not stand for the guessed rows."""
+
+    table: Rows
 
 
 class DutyTable:
@@ -88,7 +94,7 @@ def _signed(value: float, like: float) -> float:
 def table_of(text: str, where: str) -> tuple[tuple[float, float], ...]:
     """Read the rows of a table file. Raises ConfigError that names `where` and the invalid value."""
     try:
-        return TableConfig.model_validate(tomllib.loads(text)).table
+        return _TableFile.model_validate(tomllib.loads(text)).table
     except ValidationError as error:
         problem = first_problem(error, known=TableConfig.model_fields)
         raise ConfigError(f"{where}: {problem}; rows are [duty, m/s], e.g. [0.4, 0.08]") from None
@@ -310,10 +316,11 @@ class GpioDriveConfig(TableConfig):
         if path is None:
             return self.table
         try:
-            return table_of(home_path(path).read_text("utf-8-sig"), str(path))
-        except (OSError, UnicodeDecodeError) as error:
-            cause = error.strerror if isinstance(error, OSError) else "not text"
-            raise ConfigError(f"{path}: cannot be read: {cause}; write one with `sightline calibrate drive`") from None
+            return table_of(file_text(path), str(path))
+        except OSError as error:
+            raise ConfigError(
+                f"{path}: cannot be read: {error.strerror}; write one with `sightline calibrate drive`"
+            ) from None
 
     @model_validator(mode="after")
     def _are_distinct(self) -> Self:

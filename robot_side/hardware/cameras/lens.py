@@ -12,8 +12,8 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 
-from sightline.protocol.config import Config, first_problem
-from sightline.protocol.errors import ConfigError, home_path
+from sightline.protocol.config import Config, file_text, first_problem
+from sightline.protocol.errors import ConfigError
 from sightline.protocol.jpeg import JpegSize
 from sightline.protocol.messages import CameraModel
 
@@ -67,7 +67,7 @@ def guessed_model(size: JpegSize, hfov_deg: float) -> CameraModel:
 def read_model(path: Path) -> CameraModel:
     """Read a model from a TOML file. Raises ConfigError that names the file and the invalid value."""
     try:
-        table = tomllib.loads(home_path(path).read_text("utf-8-sig"))
+        table = tomllib.loads(file_text(path))
     except OSError as error:
         raise ConfigError(
             f"{path}: cannot be read: {error.strerror}; `sightline calibrate camera` writes one"

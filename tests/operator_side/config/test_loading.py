@@ -14,6 +14,11 @@ from sightline.operator_side.config.errors import is_known, known_keys, table_of
 from sightline.operator_side.config.loading import ENV_PREFIX, SERVICES, load, load_service, model_of
 from sightline.operator_side.config.toml_text import toml_text
 from sightline.protocol.errors import ConfigError
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.hardware.cameras.lens import read_model
+from sightline.robot_side.hardware.gpio import GpioDriveConfig
+from sightline.sim.robot import load_robot
+from sightline.sim.scenario import load_scenario
 
 KEY = "safety.max_linear_mps"
 ENV = "SIGHTLINE_ROBOT__SAFETY__MAX_LINEAR_MPS"
@@ -127,6 +132,44 @@ def test_file_in_another_encoding_states_the_right_one(tmp_path, encoding):
     with pytest.raises(ConfigError) as error:
         load("robot", file=str(path), environ={})
     assert one_line(error).startswith(f"{path}: ") and one_line(error).endswith("; save it as UTF-8")
+
+
+@pytest.mark.parametrize("key", ["listen", "robot", "state_dir", "safety.silence_ms"])
+@pytest.mark.parametrize("value", ["{}", "{a = 1}", "{a = {b = 1}, c = 2}"])
+def test_table_in_place_of_a_value_is_an_error_of_its_file(tmp_path, key, value):
+    (path := tmp_path / "robot.toml").write_text(f"{key} = {value}")
+    with pytest.raises(ConfigError) as error:
+        load("robot", file=str(path), environ={})
+    assert one_line(error).startswith(f"{path}: {key} = {{")
+
+
+READERS = {
+    "robot": lambda file: load("robot", file=file, environ={}),
+    "vision": lambda file: load("vision", file=file, environ={}),
+    "sim": lambda file: load("sim", file=file, environ={}),
+    "scenario": load_scenario,
+    "robot model": load_robot,
+    "lens": read_model,
+    "duty table": lambda file: GpioDriveConfig(wheel_radius_m=0.03, table_file=file).rows(),
+}
+
+
+@pytest.mark.parametrize("read", READERS.values(), ids=READERS)
+@pytest.mark.parametrize(("data", "text"), [
+    ('a = "é"'.encode("latin-1"), "not a text file in UTF-8; save it as UTF-8"),
+    ("a = 1".encode("utf-16"), "not a text file in UTF-8; save it as UTF-8"),
+    (b"#" * 1_000_001, "more than 1000000 bytes; name a TOML file"),
+])  # fmt: skip
+def test_file_without_toml_text_is_one_line_with_its_name_and_the_fix(tmp_path, read, data, text):
+    (path := tmp_path / "my.toml").write_bytes(data)
+    with pytest.raises(ConfigError) as error:
+        read(str(path))
+    assert one_line(error) == f"{path}: {text}"
+
+
+def test_largest_file_is_read(tmp_path):
+    (path := tmp_path / "my.toml").write_bytes(b"#" * 1_000_000)
+    assert load("robot", file=str(path), environ={}).config == RobotConfig()
 
 
 def test_several_errors_are_shown_as_the_first_and_a_count(tmp_path):

@@ -66,6 +66,7 @@ def test_a_written_table_reads_back():
     ("table = [", "invalid TOML"), ("table = [[0.4, 0.1], [0.4, 0.2]]", "both must rise"),
     ("table = [[0.4, 0.2], [0.6, 0.1]]", "both must rise"), ("table = [[1.4, 0.2]]", "less than or equal to 1"),
     ("table = [[0.4, nan]]", "finite"), ("tabel = [[0.4, 0.1]]", "tabel"), ("table = []", "at least 1"),
+    ("", "key 'table' is missing; rows are"),
     ("table = [[0.4]]", "table.0"), ("table = [[0.0, 0.1]]", "greater than 0"),
     (f"table = {'9' * 5000}", "invalid TOML"), (f"table = {'[' * 5000}", "invalid TOML"),
 ])  # fmt: skip
