@@ -46,7 +46,7 @@ def state_of(robot: str, missions: MissionClient, is_online: bool) -> dict[str, 
     """Return the text next to the image. Without `is_online` it is empty, because the state is unknown."""
     report = missions.operator.report if is_online else None
     lines = _robot_lines(report.status) if report is not None else []
-    mission = missions.newest(0.0)
+    mission = missions.newest(0.0) if is_online else None
     if mission is not None:
         lines.insert(0, ("mission", mission_line(mission)))
         if mission.detector:
