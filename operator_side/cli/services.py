@@ -154,13 +154,13 @@ def robot(
     loaded = load_service(
         "robot", profile=profile, file=config, sets=sets or (), options=options, environ=os.environ
     )
+    given: Any = loaded.config
+    if zero_motors:  # first, because no task may turn the wheels then
+        return set_to_zero(given)
     if task is not None:
         from sightline.operator_side.cli.calibrate import run_task
 
-        return run_task(task, loaded.config, yes)  # type: ignore[arg-type]
-    given: Any = loaded.config
-    if zero_motors:
-        return set_to_zero(given)
+        return run_task(task, given, yes)
     if given.motors.kind == "sim":
         from sightline.robot_side.plugins import DRIVES
         from sightline.sim.bus import await_simulation

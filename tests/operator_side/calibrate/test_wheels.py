@@ -146,6 +146,15 @@ def test_invalid_usage_is_one_line_and_moves_nothing(capsys, monkeypatch, argume
     assert expected in captured.err
 
 
+@pytest.mark.parametrize("task", [["test-wheels", "--yes"], ["r1"], []], ids=["test-wheels", "typing error", "none"])
+def test_zero_motors_only_sets_the_motors_to_zero(tmp_path, monkeypatch, task):
+    monkeypatch.setattr(wheel_test, "turn_for", lambda *_given: pytest.fail("it moved"))
+    log = tmp_path / "drive.csv"
+    sets = ["--set", "drive.kind=log", "--set", f"drive.options.path={log}"]
+    assert cli.run(["robot", *task, "--zero-motors", *sets]) == 0
+    assert commanded(log) == [(0.0, 0.0)]
+
+
 # --- in a terminal ---------------------------------------------------------------------------------------------------
 
 
