@@ -54,6 +54,16 @@ def test_watchdog_of_the_legacy_page_has_ten_lines_and_stops_a_robot_without_com
     feed()
 
 
+def test_contract_program_of_the_device_page_checks_the_drive_of_the_examples(monkeypatch):
+    page = (ROOT / "docs/how-to/add-a-device.md").read_text()
+    code = textwrap.dedent(page.partition("<!-- contract -->\n")[2].partition("```python\n")[2].partition("```")[0])
+    monkeypatch.syspath_prepend(ROOT / "examples")
+    exec(code, names := {})  # the reader's own program
+    monkeypatch.setattr(names["MyDrive"], "set", lambda *_speeds: None)
+    with pytest.raises(AssertionError):
+        exec(code, {})
+
+
 class CutOff:
     """Runs the sketch of the page on a simulated pulse train, a loop per millisecond."""
 
