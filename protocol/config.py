@@ -180,7 +180,10 @@ def _imported(path: str) -> Any:
 
 
 def _folder_hint(error: BaseException, kind: str) -> str:
-    """Return where the module of a class is searched, if it is the module that is missing."""
+    """Return where the module of a class is searched, if it is the module that is missing, or its name without .py."""
+    file, _, name = kind.partition(":")
+    if file.endswith(".py"):
+        return f"; write {file.removesuffix('.py')}:{name}"
     module = kind.partition(":")[0].partition(".")[0]
     is_absent = isinstance(error, ModuleNotFoundError) and error.name == module and module not in _OLD_PACKAGES
     return f"; start the command in the folder that has {module}, not in {Path.cwd()}" if is_absent else ""

@@ -181,8 +181,9 @@ def _from_set(text: str) -> Given:
 def _from_options(options: Mapping[str, Any]) -> Iterable[Given]:
     for key, value in options.items():
         if value is not None:
-            name = key.rpartition(".")[2].replace("_", "-")
-            yield Given(tuple(key.split(".")), value, f"--{name}")
+            table, _, name = key.rpartition(".")
+            name = table if name == "kind" else name  # detector.kind is the option --detector
+            yield Given(tuple(key.split(".")), value, f"--{name.replace('_', '-')}")
 
 
 # --- merging and checking ----------------------------------------------------------------------------------------

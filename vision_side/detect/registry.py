@@ -147,10 +147,15 @@ def split_kind(kind: str) -> tuple[str, str]:
     name, colon, rest = kind.partition(":")
     if name not in REGISTRY.names():
         if Path(kind).is_file():
+            if kind.endswith(".py"):
+                raise ConfigError(f"detector {kind!r} is a file of Python: write {Path(kind).stem}:NAME for its class "
+                                  "NAME, and start the command in its folder")
             raise ConfigError(f"detector {kind!r} is a file: write onnx:{kind}, or torch:{kind} for a model of PyTorch")
         return kind, ""
     if colon and not rest:
-        raise ConfigError(f"detector {kind!r} has nothing after its colon; write {EXAMPLES.get(name, name)}")
+        example = getattr(REGISTRY.load(name), "example", "")  # of a detector that needs a model
+        wanted = EXAMPLES.get(name) or (f"e.g. {name}:{example}" if example else name)
+        raise ConfigError(f"detector {kind!r} has nothing after its colon; write {wanted}")
     return name, kind if rest.startswith("//") else rest
 
 
