@@ -159,7 +159,7 @@ def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
                 pipelines[header.session] = Pipeline(config, camera, detector)
             pipeline = pipelines[header.session]
             _give(pipeline, header, answers, config)
-            if sent is None and waits_for_service(config):  # the answer was late, and now it may be in time
+            if sent is None and _may_be_late(header, config):  # and now it may be in time
                 yield Step(frame, None, pipeline.acknowledge(_NO_ANSWER, NO_ANSWER))
             elif config.detector.kind == "boxes":
                 found = answers.boxes.get((frame.header.session, frame.header.seq))
@@ -167,6 +167,11 @@ def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
                     yield Step(frame, sent, _by_boxes(pipeline, frame, found, camera, config))
             else:
                 yield Step(frame, sent, pipeline.step(frame))
+
+
+def _may_be_late(header: AnswerHeader, config: VisionConfig) -> bool:
+    """Return True if the detector may have missed its deadline; a local one begins no frame after it."""
+    return header.compute_us >= config.detector.deadline_s * 1e6 or waits_for_service(config)
 
 
 def _by_boxes(

@@ -1,5 +1,7 @@
 """Scans and missions of a vision service return from a recording, byte for byte."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from sightline.evaluation.lockstep import Conditions, Lockstep
@@ -14,6 +16,8 @@ from sightline.sim.scenario import load_scenario
 from sightline.sim.world.world import World
 from sightline.vision_side.config import DetectorConfig, MissionConfig
 from sightline.vision_side.detect.color.detectors import Hsv
+from sightline.vision_side.detect.port import NO_DEADLINE
+from sightline.vision_side.serving import service
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 from tests.operator_side.recording.test_recorder import record
 from tests.vision_side.serving.test_mission_channel import FRAME_US, GOTO, MODEL, Bench, scan
@@ -132,6 +136,38 @@ def test_frame_of_a_late_remote_detector_is_acknowledged_again(monkeypatch, tmp_
     steps = list(replay_steps(path))
     assert [step.sent is None for step in steps] == [*[False] * 5, *[True] * late, *[False] * 5]
     assert replay(path).ok and {step.answer.skipped for step in steps} == {"", "NO_ANSWER"}
+
+
+class Local(Hsv):
+    """A detector of this process. When it begins after the deadline, it gives no answer."""
+
+    took_s = 0.0
+    spent_s = 0.0
+
+    def detect(self, frames, deadline_us):
+        Local.spent_s += Local.took_s
+        is_late = Local.took_s > 0 and deadline_us != NO_DEADLINE
+        return [None] * len(frames) if is_late else super().detect(frames, deadline_us)
+
+
+@pytest.mark.parametrize("took_s", [0.01, 0.099, 0.1, 0.3])
+def test_only_a_frame_after_its_deadline_is_not_examined_again(monkeypatch, tmp_path, took_s):
+    """Each other answer is compared, so that a detector that gives another answer each time is found."""
+    detector = DetectorConfig(kind=f"{__name__}:Local", deadline_s=0.1)
+    path, config = tmp_path / "run.mcap", GOTO.model_copy(update={"detector": detector, "mission": MissionConfig()})
+    spent = {"perf_counter_ns": lambda: round(Local.spent_s * 1e9)}
+    monkeypatch.setattr(service, "time", SimpleNamespace(**vars(service.time) | spent))
+    bench = Bench(config=config)
+    bench.image = jpeg_of(scene(MODEL, 1.1, 0.1, shaded=True))
+    with Recorder(bench.network.link("r1"), path, {VISION_CONFIG: config.model_dump_json()}):
+        show_camera(bench, MODEL)
+        bench.frames(5)
+        monkeypatch.setattr(Local, "took_s", took_s)
+        bench.frames(2)
+        monkeypatch.setattr(Local, "took_s", 0.0)
+        bench.frames(5)
+    assert [step.sent is None for step in replay_steps(path)] == [*[False] * 5, *[True] * 2, *[False] * 5]
+    assert replay(path).ok is (took_s >= detector.deadline_s)
 
 
 def test_twist_that_was_sent_twice_is_computed_once(tmp_path):
