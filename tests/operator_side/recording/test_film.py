@@ -348,9 +348,10 @@ def test_recording_replaces_an_earlier_one_only_if_it_has_messages(monkeypatch, 
     path, link = tmp_path / "run.mcap", tmp_path / "link.mcap"
     path.write_bytes(b"earlier")
     link.symlink_to(path)
-    monkeypatch.setattr("sightline.operator_side.recording.film.PATIENCE_S", 0.01)
-    with pytest.raises(LinkError, match=r"no image from robot 'r1' after 0\.01 s"):
-        record(Talking(), Talking(), link, FRAME, 60.0)
+    with monkeypatch.context() as patch:
+        patch.setattr("sightline.operator_side.recording.film.PATIENCE_S", 0.01)
+        with pytest.raises(LinkError, match=r"no image from robot 'r1' after 0\.01 s"):
+            record(Talking(), Talking(), link, FRAME, 60.0)
     assert path.read_bytes() == b"earlier"
     robot = Talking([status(1)])
     record(robot, robot, link, FRAME, 0.01)
